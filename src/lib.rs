@@ -1,0 +1,4 @@
+//! volpack
+pub mod codec;
+pub mod vdb;
+pub mod volume;

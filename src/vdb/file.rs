@@ -1,0 +1,256 @@
+//! A file: its header, its grids, and the way to one grid's tree.
+
+use std::borrow::Cow;
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::ops::Range;
+use std::path::Path;
+use std::sync::Mutex;
+
+use super::cursor::Cursor;
+use super::grid::{Descriptor, GridInfo, read_metadata};
+use super::tree::Tree;
+use super::tree_read::{read_leaves, read_topology, skip_leaves};
+use super::value::{Value, ValueType, with_value_type};
+use super::{Result, VdbError};
+
+/// `OPENVDB_MAGIC` as a little-endian 64-bit word.
+const MAGIC: u64 = 0x5644_4220;
+/// `NODE_MASK_COMPRESSION`: older files order a node's data otherwise.
+const OLDEST: u32 = 222;
+/// The newest version whose trees were checked against OpenVDB's own reader's source.
+const NEWEST: u32 = 225;
+/// First guess of how many bytes a header needs; a grid's metadata can be longer.
+const WINDOW: u64 = 16 << 10;
+
+/// An open OpenVDB file.
+#[derive(Debug)]
+pub struct VdbFile {
+    /// The file format's version, 222 to 225.
+    pub version: u32,
+    /// The version of the OpenVDB library that wrote it.
+    pub library: (u32, u32),
+    /// File-level metadata that is text, for instance `creator`.
+    pub metadata: Vec<(String, String)>,
+    /// The grids, in the order of the file.
+    pub grids: Vec<GridInfo>,
+    source: Source,
+}
+
+#[derive(Debug)]
+enum Source {
+    File { file: Mutex<File>, len: u64 },
+    Memory(Vec<u8>),
+}
+
+impl VdbFile {
+    /// Opens a file and reads everything but trees.
+    ///
+    /// # Errors
+    /// [`VdbError`] for a file that cannot be read, is not OpenVDB, or contradicts itself.
+    pub fn open(path: &Path) -> Result<Self> {
+        let file = File::open(path)?;
+        let len = file.metadata()?.len();
+        Self::from_source(Source::File { file: Mutex::new(file), len })
+    }
+
+    /// The same for a file that is in memory.
+    ///
+    /// # Errors
+    /// As [`VdbFile::open`].
+    pub fn from_bytes(bytes: Vec<u8>) -> Result<Self> {
+        Self::from_source(Source::Memory(bytes))
+    }
+
+    fn from_source(source: Source) -> Result<Self> {
+        let (header, at) = source.parse(0, Header::read)?;
+        let Header { version, library, has_offsets, metadata, grid_count } = header;
+        let (grids, source) = if has_offsets {
+            (read_grids(&source, at, grid_count)?, source)
+        } else {
+            // Without offsets the only way to a grid is through all before it.
+            let bytes = source.range(0..source.len())?.into_owned();
+            (read_streamed_grids(&bytes, at, grid_count)?, Source::Memory(bytes))
+        };
+        Ok(Self { version, library, metadata, grids, source })
+    }
+
+    /// The grid of that name. `density` finds the first of several of that name, `density[1]` the
+    /// second.
+    ///
+    /// # Errors
+    /// [`VdbError::NoGrid`], which lists the grids there are.
+    pub fn grid(&self, name: &str) -> Result<&GridInfo> {
+        self.grids.iter().find(|g| g.name == name).ok_or_else(|| VdbError::NoGrid {
+            name: name.to_owned(),
+            have: self.grids.iter().map(|g| g.name.clone()).collect(),
+        })
+    }
+
+    /// Reads a grid's masks and tiles, but not its leaves' values.
+    ///
+    /// # Errors
+    /// [`VdbError::Grid`] around what is wrong.
+    pub fn read_topology<T: Value>(&self, grid: &GridInfo) -> Result<Tree<T>> {
+        self.with_tree(grid, read_topology)
+    }
+
+    /// Reads a grid's whole tree. `T` must be its value type. The leaves are decoded on the current
+    /// rayon pool.
+    ///
+    /// # Errors
+    /// [`VdbError::Grid`] around what is wrong.
+    pub fn read_tree<T: Value>(&self, grid: &GridInfo) -> Result<Tree<T>> {
+        self.with_tree(grid, |c, owner| {
+            let mut tree = read_topology(c, owner)?;
+            read_leaves(c, owner, &mut tree)?;
+            Ok(tree)
+        })
+    }
+
+    fn with_tree<R>(
+        &self,
+        grid: &GridInfo,
+        read: impl FnOnce(&mut Cursor, &GridInfo) -> Result<R>,
+    ) -> Result<R> {
+        let owner = grid.instance_of.map_or(grid, |i| &self.grids[i]);
+        self.source
+            .range(owner.tree.clone())
+            .and_then(|bytes| read(&mut Cursor::new(&bytes, owner.tree.start), owner))
+            .map_err(|e| e.in_grid(&grid.name))
+    }
+}
+
+struct Header {
+    version: u32,
+    library: (u32, u32),
+    has_offsets: bool,
+    metadata: Vec<(String, String)>,
+    grid_count: u32,
+}
+
+impl Header {
+    /// OpenVDB's `Archive::readHeader`, then the file's metadata and grid count.
+    fn read(c: &mut Cursor) -> Result<Self> {
+        match c.array::<8>("the magic number") {
+            Ok(magic) if u64::from_le_bytes(*magic) == MAGIC => {}
+            _ => return Err(VdbError::NotVdb),
+        }
+        let version = c.u32("the file version")?;
+        if !(OLDEST..=NEWEST).contains(&version) {
+            return Err(VdbError::Version(version));
+        }
+        let library = (c.u32("the library version")?, c.u32("the library version")?);
+        let has_offsets = c.u8("the offsets flag")? != 0;
+        c.take(36, "the file's UUID")?;
+        let metadata = read_metadata(c)?;
+        let at = c.at();
+        let grid_count = u32::try_from(c.i32("the grid count")?)
+            .map_err(|_| VdbError::corrupt(at, "the grid count is negative"))?;
+        Ok(Self { version, library, has_offsets, metadata, grid_count })
+    }
+}
+
+fn read_grids(source: &Source, mut at: u64, count: u32) -> Result<Vec<GridInfo>> {
+    let mut grids = Vec::new();
+    for _ in 0..count {
+        let (descriptor, behind) = source.parse(at, Descriptor::read)?;
+        let [start, _, end] = descriptor.offsets.map(|o| u64::try_from(o).unwrap_or(u64::MAX));
+        let name = descriptor.display_name();
+        // Offsets that only ever grow end the loop on any file.
+        if start < behind || end < start || end > source.len() {
+            return Err(VdbError::corrupt(
+                at,
+                format!("its offsets {start} to {end} lie outside the file's {} bytes", source.len()),
+            )
+            .in_grid(&name));
+        }
+        let (grid, _) = source
+            .parse(start, |c| GridInfo::read(c, &descriptor, &grids, end))
+            .map_err(|e| e.in_grid(&name))?;
+        if grid.tree.start > end {
+            return Err(VdbError::corrupt(start, "its header runs past its end").in_grid(&name));
+        }
+        grids.push(grid);
+        at = end;
+    }
+    Ok(grids)
+}
+
+fn read_streamed_grids(bytes: &[u8], at: u64, count: u32) -> Result<Vec<GridInfo>> {
+    let mut c = Cursor::new(bytes, 0).seek(at as usize);
+    let mut grids = Vec::new();
+    for i in 0..count {
+        let descriptor = Descriptor::read(&mut c)?;
+        let name = descriptor.display_name();
+        let mut grid =
+            GridInfo::read(&mut c, &descriptor, &grids, bytes.len() as u64).map_err(|e| e.in_grid(&name))?;
+        if grid.instance_of.is_none() {
+            // The last grid may be of any type, since nothing has to be found behind it.
+            if i + 1 < count {
+                skip_tree(&mut c, &grid).map_err(|e| e.in_grid(&name))?;
+            }
+            grid.tree.end = grid.tree.end.min(if i + 1 < count { c.at() } else { u64::MAX });
+        }
+        grids.push(grid);
+    }
+    Ok(grids)
+}
+
+fn skip_tree(c: &mut Cursor, grid: &GridInfo) -> Result<()> {
+    let unsupported = |name: &str| {
+        Err(VdbError::Unsupported(format!(
+            "a {name} grid in a file without grid offsets hides the grids behind it: \
+             write the file with offsets (OpenVDB's io::File)"
+        )))
+    };
+    with_value_type!(&grid.value_type,
+        T => {
+            if grid.value_type == ValueType::PointDataIndex32 {
+                return unsupported(grid.value_type.name());
+            }
+            let tree = read_topology::<T>(c, grid)?;
+            skip_leaves(c, grid, &tree)
+        },
+        name => unsupported(name)
+    )
+}
+
+impl Source {
+    fn len(&self) -> u64 {
+        match self {
+            Self::File { len, .. } => *len,
+            Self::Memory(bytes) => bytes.len() as u64,
+        }
+    }
+
+    /// The bytes of `range`, which must lie inside the file.
+    fn range(&self, range: Range<u64>) -> Result<Cow<'_, [u8]>> {
+        match self {
+            Self::Memory(bytes) => Ok(Cow::Borrowed(&bytes[range.start as usize..range.end as usize])),
+            Self::File { file, .. } => {
+                let mut bytes = vec![0; (range.end - range.start) as usize];
+                let mut file = file.lock().expect("no reader panics while it holds the file");
+                file.seek(SeekFrom::Start(range.start))?;
+                file.read_exact(&mut bytes)?;
+                Ok(Cow::Owned(bytes))
+            }
+        }
+    }
+
+    /// Parses at byte `at` with as much of the file as that takes, and says where it ended.
+    fn parse<R>(&self, at: u64, parse: impl Fn(&mut Cursor) -> Result<R>) -> Result<(R, u64)> {
+        let left = self.len().saturating_sub(at);
+        let mut window = WINDOW.min(left);
+        loop {
+            let bytes = self.range(at..at + window)?;
+            let mut c = Cursor::new(&bytes, at);
+            match parse(&mut c) {
+                Err(VdbError::Truncated { .. }) if window < left => {
+                    window = (window * 4).min(left);
+                }
+                result => return result.map(|r| (r, c.at())),
+            }
+        }
+    }
+}

@@ -1,0 +1,84 @@
+//! An 8³ block of voxels, and what its inactive voxels are.
+
+use super::Mask512;
+
+/// Voxels in a brick.
+pub const BRICK_VOXELS: usize = 512;
+
+/// One brick of the source: every voxel's value and active state, x slowest, z fastest.
+#[derive(Clone, PartialEq)]
+pub struct Brick {
+    /// The 512 values, those of inactive voxels too.
+    pub values: [f32; BRICK_VOXELS],
+    /// Which voxels are active; `None` where a voxel is active if its value is not the background.
+    pub mask: Option<Mask512>,
+}
+
+/// What an inactive voxel under a mask reads as. The numbers are the pack's.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[repr(u8)]
+pub enum InactiveRule {
+    /// The background.
+    Background = 0,
+    /// The background with its sign flipped: the inside of a level set.
+    MinusBackground = 1,
+    /// Minus the background where the mask's second half is on, else the background.
+    Sign = 2,
+    /// What the texel says.
+    Texel = 3,
+}
+
+impl InactiveRule {
+    /// The rule with this number, 0 to 3.
+    pub fn from_bits(bits: u32) -> Self {
+        match bits & 3 {
+            0 => Self::Background,
+            1 => Self::MinusBackground,
+            2 => Self::Sign,
+            _ => Self::Texel,
+        }
+    }
+}
+
+impl Brick {
+    /// The simplest rule that gives every inactive voxel back bit by bit, and for
+    /// [`InactiveRule::Sign`] the mask of those at minus the background.
+    pub fn inactive_rule(&self, background: f32) -> (InactiveRule, Mask512) {
+        let Some(mask) = &self.mask else { return (InactiveRule::Texel, Mask512::NONE) };
+        let mut minus = Mask512::NONE;
+        let mut inactive = 0;
+        for i in (0..BRICK_VOXELS).filter(|&i| !mask.get(i)) {
+            inactive += 1;
+            let bits = self.values[i].to_bits();
+            if bits == background.to_bits() {
+            } else if bits == (-background).to_bits() {
+                minus.set(i);
+            } else {
+                return (InactiveRule::Texel, Mask512::NONE);
+            }
+        }
+        match minus.count() {
+            0 => (InactiveRule::Background, minus),
+            n if n == inactive => (InactiveRule::MinusBackground, minus),
+            _ => (InactiveRule::Sign, minus),
+        }
+    }
+
+    /// Whether every voxel is active with the same bits, or inactive with the same bits.
+    pub fn constant(&self) -> Option<super::Constant> {
+        let mask = self.mask?;
+        let first = self.values[0];
+        let same = || self.values.iter().all(|v| v.to_bits() == first.to_bits());
+        (mask == Mask512::ALL && same()).then_some(super::Constant { value: first, active: true }).or_else(
+            || (mask == Mask512::NONE && same()).then_some(super::Constant { value: first, active: false }),
+        )
+    }
+
+    /// Smallest and largest value among the voxels that `carried` names.
+    pub fn range_over(&self, carried: &Mask512) -> Option<(f32, f32)> {
+        carried.ones().map(|i| self.values[i]).fold(None, |range, v| match range {
+            None => Some((v, v)),
+            Some((min, max)) => Some((min.min(v), max.max(v))),
+        })
+    }
+}

@@ -1,0 +1,104 @@
+//! One grid of one frame, flattened: constant regions and bricks by 128³ cell.
+
+use super::{Brick, Coord, CoordBox};
+
+/// A region of one value.
+#[derive(Clone, Copy, Debug)]
+pub struct Constant {
+    /// The value of every voxel in it.
+    pub value: f32,
+    /// Whether they are active.
+    pub active: bool,
+}
+
+impl Constant {
+    /// Value and state as bits, to compare and to hash.
+    pub fn key(self) -> (u32, bool) {
+        (self.value.to_bits(), self.active)
+    }
+}
+
+/// What stands at one of an L2 node's 4096 places.
+#[derive(Clone, Copy, Debug)]
+pub enum Child {
+    /// A constant 8³ region.
+    Constant(Constant),
+    /// The brick at this place of [`FlatFrame::bricks`].
+    Brick(u32),
+}
+
+/// What fills a 128³ cell.
+#[derive(Clone, Debug)]
+pub enum CellContent {
+    /// One value.
+    Constant(Constant),
+    /// Children by their place (x slowest, z fastest), ascending; places that are not named are
+    /// inactive background.
+    Node(Vec<(u16, Child)>),
+}
+
+/// A 128³ cell that is not all background.
+#[derive(Clone, Debug)]
+pub struct Cell {
+    /// Smallest corner, a multiple of 128.
+    pub origin: Coord,
+    /// What fills it.
+    pub content: CellContent,
+}
+
+/// A closed range of values.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ValueRange {
+    /// The smallest.
+    pub min: f32,
+    /// The largest.
+    pub max: f32,
+}
+
+impl ValueRange {
+    /// The range of one value.
+    pub fn of(value: f32) -> Self {
+        Self { min: value, max: value }
+    }
+
+    /// The smallest range around both.
+    pub fn union(self, other: Self) -> Self {
+        Self { min: self.min.min(other.min), max: self.max.max(other.max) }
+    }
+
+    /// The smallest range around all of them; `None` for none.
+    pub fn union_all(ranges: impl IntoIterator<Item = Self>) -> Option<Self> {
+        ranges.into_iter().reduce(Self::union)
+    }
+}
+
+/// Counts of one frame, taken from the source before anything is simplified.
+#[derive(Clone, Copy, Debug)]
+pub struct FrameStats {
+    /// Leaves of the source tree.
+    pub leaves: u64,
+    /// Active voxels, tiles in full.
+    pub active_voxels: u64,
+    /// The active voxels' box.
+    pub bbox: CoordBox,
+    /// The range of active values, tiles included.
+    pub active_range: Option<ValueRange>,
+    /// The range of every value that is neither outside all nodes nor a rule: active values, and
+    /// inactive ones other than plus or minus the background.
+    pub carried_range: Option<ValueRange>,
+    /// Values that were infinite or not a number.
+    pub nonfinite: u64,
+}
+
+/// One grid of one frame in absolute index coordinates.
+#[derive(Clone)]
+pub struct FlatFrame {
+    /// Constant 4096³ regions.
+    pub roots: Vec<(Coord, Constant)>,
+    /// The cells that are not all background, ascending by origin.
+    pub cells: Vec<Cell>,
+    /// The bricks that the cells name, in the order in which they name them.
+    pub bricks: Vec<Brick>,
+    /// The source's counts.
+    pub stats: FrameStats,
+}

@@ -1,0 +1,15 @@
+//! Coordinates, masks, bricks and frames: the types that flow down the stages.
+//!
+//! This room knows nothing of OpenVDB files, codecs or packs.
+
+mod brick;
+mod coord;
+mod frame;
+mod mask;
+mod pool;
+
+pub use brick::{BRICK_VOXELS, Brick, InactiveRule};
+pub use coord::{BRICK_DIM, CELL_DIM, Coord, CoordBox, ROOT_DIM};
+pub use frame::{Cell, CellContent, Child, Constant, FlatFrame, FrameStats, ValueRange};
+pub use mask::{Mask512, bits};
+pub use pool::{BrickPool, Interner};
