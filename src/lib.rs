@@ -1,4 +1,49 @@
-//! volpack
+//! volpack turns OpenVDB volumes and animation sequences into game-ready volume packs, and proves each
+//! pack against its source.
+//!
+//! Data walks one way, down eight [`stages`]:
+//!
+//! ```text
+//! .vdb files ─ metadata ─ select ─ flatten ─ dedup ─ allocate ─ relayout ─ quantise ─ serialise ─ .volpack
+//!                                                                                                   │
+//! .vdb files ──────────────────────────────────────────────────────────────────────────────────── verify
+//! ```
+//!
+//! - [`vdb`] reads OpenVDB files.
+//! - [`volume`] has the types that flow: coordinates, masks, bricks, frames.
+//! - [`codec`] knows how one brick becomes texels and what a GPU reads from them.
+//! - [`pack`] is the file format: writer, reader, checks, decoder.
+//! - [`pipeline`] strings the stages together, [`manifest`] says with what [`settings`].
+//! - [`verify`] compares a finished pack with its source, [`report`] puts files into figures.
+//! - [`cli`] is the command line.
+//!
+//! To build a pack:
+//!
+//! ```no_run
+//! use volpack::pipeline::{Job, Silent, VerifyLevel, build};
+//! use volpack::settings::{Format, Settings};
+//!
+//! let job = Job {
+//!     frames: vec!["smoke.vdb".into()],
+//!     output: "smoke.volpack".into(),
+//!     settings: Settings { format: Format::Bc7, ..Settings::default() },
+//!     strict: false,
+//!     verify: VerifyLevel::Voxels,
+//! };
+//! let outcome = build(&job, &mut Silent)?;
+//! assert!(outcome.verification.is_some_and(|report| report.ok));
+//! # Ok::<(), volpack::error::Error>(())
+//! ```
+
+pub mod cli;
 pub mod codec;
+pub mod error;
+pub mod manifest;
+pub mod pack;
+pub mod pipeline;
+pub mod report;
+pub mod settings;
+pub mod stages;
 pub mod vdb;
+pub mod verify;
 pub mod volume;

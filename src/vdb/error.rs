@@ -38,14 +38,6 @@ pub enum VdbError {
     /// Valid OpenVDB that volpack does not read.
     #[error("{0}")]
     Unsupported(String),
-    /// No grid of this name.
-    #[error("no grid {name:?}; the file has {}", list(.have))]
-    NoGrid {
-        /// The name that was asked for.
-        name: String,
-        /// The grids that exist.
-        have: Vec<String>,
-    },
     /// Any of the above, inside a named grid.
     #[error("grid {grid:?}: {source}")]
     Grid {
@@ -73,8 +65,4 @@ impl VdbError {
             _ => false,
         }
     }
-}
-
-fn list(names: &[String]) -> String {
-    if names.is_empty() { "no grids".to_owned() } else { names.join(", ") }
 }

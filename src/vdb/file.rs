@@ -75,18 +75,6 @@ impl VdbFile {
         Ok(Self { version, library, metadata, grids, source })
     }
 
-    /// The grid of that name. `density` finds the first of several of that name, `density[1]` the
-    /// second.
-    ///
-    /// # Errors
-    /// [`VdbError::NoGrid`], which lists the grids there are.
-    pub fn grid(&self, name: &str) -> Result<&GridInfo> {
-        self.grids.iter().find(|g| g.name == name).ok_or_else(|| VdbError::NoGrid {
-            name: name.to_owned(),
-            have: self.grids.iter().map(|g| g.name.clone()).collect(),
-        })
-    }
-
     /// Reads a grid's masks and tiles, but not its leaves' values.
     ///
     /// # Errors

@@ -104,7 +104,7 @@ impl Descriptor {
 impl GridInfo {
     /// Reads what stands between a descriptor and its tree: compression, metadata, transform. The
     /// tree's range is left from there to `end`.
-    pub fn read(c: &mut Cursor, descriptor: &Descriptor, earlier: &[Self], end: u64) -> Result<Self> {
+    pub(super) fn read(c: &mut Cursor, descriptor: &Descriptor, earlier: &[Self], end: u64) -> Result<Self> {
         let compression = Compression::read(c)?;
         let class = read_metadata(c)?
             .into_iter()

@@ -83,9 +83,6 @@ pub struct FrameStats {
     pub bbox: CoordBox,
     /// The range of active values, tiles included.
     pub active_range: Option<ValueRange>,
-    /// The range of every value that is neither outside all nodes nor a rule: active values, and
-    /// inactive ones other than plus or minus the background.
-    pub carried_range: Option<ValueRange>,
     /// Values that were infinite or not a number.
     pub nonfinite: u64,
 }

@@ -113,10 +113,15 @@ impl Brick {
 }
 
 /// Keeps one copy of each run of values, in one growing array, and gives back where it lies.
-#[derive(Default)]
 pub struct Interner<T> {
     by_hash: HashMap<u128, u32>,
     items: Vec<T>,
+}
+
+impl<T> Default for Interner<T> {
+    fn default() -> Self {
+        Self { by_hash: HashMap::new(), items: Vec::new() }
+    }
 }
 
 impl<T: bytemuck::Pod> Interner<T> {

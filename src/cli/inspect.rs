@@ -1,0 +1,144 @@
+//! `volpack inspect`.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+
+use super::print_json;
+use super::style::{TITLE, bytes, count};
+use crate::error::{Error, Result};
+use crate::pack::{Pack, layout};
+use crate::report::{GridSummary, PackSummary, VdbSummary};
+
+#[derive(Args)]
+pub struct InspectArgs {
+    /// A .vdb or a .volpack
+    file: PathBuf,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+    /// Read the voxels of a .vdb too, and say their range and sum
+    #[arg(long)]
+    values: bool,
+}
+
+pub fn run(args: &InspectArgs) -> Result<()> {
+    if is_pack(&args.file)? {
+        let pack = Pack::open(&args.file).map_err(Error::pack(&args.file))?;
+        let summary = PackSummary::new(&pack);
+        if args.json {
+            print_json(&summary);
+        } else {
+            print_pack(&args.file, &pack, &summary);
+        }
+    } else {
+        let summary = VdbSummary::read(&args.file, args.values)?;
+        if args.json {
+            print_json(&summary);
+        } else {
+            print_vdb(&args.file, &summary);
+        }
+    }
+    Ok(())
+}
+
+fn is_pack(path: &Path) -> Result<bool> {
+    let mut magic = Vec::new();
+    let file = File::open(path).map_err(Error::io(path))?;
+    file.take(layout::MAGIC.len() as u64).read_to_end(&mut magic).map_err(Error::io(path))?;
+    Ok(magic == layout::MAGIC)
+}
+
+fn print_vdb(path: &Path, file: &VdbSummary) {
+    let by = file.creator.as_ref().map(|c| format!(", by {c}")).unwrap_or_default();
+    anstream::println!(
+        "{TITLE}{}{TITLE:#}: OpenVDB file version {}, library {}{by}",
+        path.display(),
+        file.version,
+        file.library
+    );
+    if file.grids.is_empty() {
+        anstream::println!("  no grids");
+    }
+    for grid in &file.grids {
+        print_grid(grid);
+    }
+}
+
+fn print_grid(g: &GridSummary) {
+    let half = if g.half { " (half)" } else { "" };
+    let packable = if g.packable { "" } else { ", cannot be packed" };
+    anstream::println!("\n  {TITLE}{}{TITLE:#}: {}{half}, {}{packable}", g.name, g.value_type, g.class);
+    anstream::println!("    map           {}", g.map);
+    anstream::println!("    background    {}", g.background);
+    let tiles = [("4096³", g.root_tiles), ("128³", g.l1_tiles), ("8³", g.l2_tiles)];
+    let tiles: Vec<_> =
+        tiles.iter().filter(|(_, n)| *n > 0).map(|(dim, n)| format!("{} of {dim}", count(*n))).collect();
+    let tiles = if tiles.is_empty() { "none".to_owned() } else { tiles.join(", ") };
+    anstream::println!("    leaves        {}", count(g.leaves));
+    anstream::println!("    active tiles  {tiles}");
+    anstream::println!("    active voxels {}", count(g.active_voxels));
+    if g.active_voxels > 0 {
+        let [a, b, c, d, e, f] = g.bbox;
+        anstream::println!("    box           [{a}, {b}, {c}] to [{d}, {e}, {f}]");
+    }
+    if let Some(v) = &g.values {
+        anstream::println!("    values        {} to {}, sum {}", v.min, v.max, v.sum);
+        if v.nonfinite != 0 {
+            anstream::println!("    not finite    {}", v.nonfinite);
+        }
+    }
+}
+
+fn print_pack(path: &Path, pack: &Pack, summary: &PackSummary) {
+    let p = &pack.provenance;
+    anstream::println!(
+        "{TITLE}{}{TITLE:#}: {}, pack format {}, by {} {}",
+        path.display(),
+        bytes(summary.file_bytes),
+        layout::VERSION,
+        p.tool,
+        p.version
+    );
+    for grid in &pack.grids {
+        let r = &grid.record;
+        let numbers: Vec<i32> = grid.frames.iter().map(|f| f.record.number).collect();
+        let frames = match (numbers.first(), numbers.last()) {
+            (Some(first), Some(last)) if first != last => format!("frames {first} to {last}"),
+            (Some(only), _) => format!("frame {only}"),
+            _ => "no frames".to_owned(),
+        };
+        anstream::println!(
+            "  {TITLE}{}{TITLE:#}: {frames}, values {} to {}",
+            grid.name,
+            r.active_min,
+            r.active_max
+        );
+    }
+    print_sizes(summary);
+}
+
+/// The lines that say what a pack holds and takes.
+pub fn print_sizes(p: &PackSummary) {
+    let frames = if p.frames == 1 { "frame" } else { "frames" };
+    anstream::println!(
+        "  {} {frames}, {} bricks, {} unique",
+        count(p.frames),
+        count(p.bricks),
+        count(p.unique_bricks)
+    );
+    for (codec, c) in &p.codecs {
+        let texels = if c.bytes > 0 { format!("  {}", bytes(c.bytes)) } else { String::new() };
+        anstream::println!("    {codec:9} {:>10} bricks{texels}", count(c.bricks));
+    }
+    anstream::println!(
+        "  GPU {}: tree {}, masks {}, texels {}; {:.3} bits a voxel",
+        bytes(p.gpu_bytes),
+        bytes(p.tree_bytes),
+        bytes(p.mask_bytes),
+        bytes(p.texel_bytes),
+        p.bits_per_voxel
+    );
+}

@@ -1,0 +1,148 @@
+//! The command line: one file a subcommand.
+
+mod build;
+mod inspect;
+mod progress;
+mod style;
+mod verify;
+
+use std::path::PathBuf;
+
+use clap::{Args, Parser, Subcommand};
+
+use crate::error::{Error, Result};
+use crate::pipeline::VerifyLevel;
+use crate::settings::{DEFAULT_ZSTD, Format, Masks, NonFinite, RangeMode, Settings};
+
+const EXIT_CODES: &str = "\
+Exit codes:
+  0  done
+  1  failed for another reason, such as a full disk
+  2  wrong usage: an unknown option, grid or asset
+  3  a file that cannot be read or is invalid
+  4  verification failed: a pack does not say what its source says
+  5  over budget
+  6  not supported here: a grid type, file version or device";
+
+/// Turns OpenVDB volumes and animation sequences into game-ready volume packs, and proves each pack
+/// against its source.
+#[derive(Parser)]
+#[command(name = "volpack", version, after_help = EXIT_CODES, max_term_width = 100)]
+pub struct Cli {
+    #[command(subcommand)]
+    command: Command,
+    #[command(flatten)]
+    common: Common,
+}
+
+#[derive(Args, Clone, Copy)]
+struct Common {
+    /// Print nothing but errors
+    #[arg(short, long, global = true)]
+    quiet: bool,
+    /// Say more: seconds by stage, every frame
+    #[arg(short, long, global = true)]
+    verbose: bool,
+    /// Threads to use; all cores where none are given
+    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    threads: Option<u16>,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Build packs from a manifest, or one pack from files
+    Build(build::BuildArgs),
+    /// Say what is in a .vdb or a .volpack
+    Inspect(inspect::InspectArgs),
+    /// Prove a pack against its source
+    Verify(verify::VerifyArgs),
+}
+
+/// How a pack is made, for builds without a manifest.
+#[derive(Args)]
+struct SettingsArgs {
+    /// A grid to pack; may be given more than once [default: density, else the only scalar grid]
+    #[arg(short, long = "grid", value_name = "NAME")]
+    grids: Vec<String>,
+    /// How bricks are stored
+    #[arg(short, long, default_value = "unorm8")]
+    format: Format,
+    /// What the 0 and 1 of unorm8, bc4 and bc7 texels stand for
+    #[arg(short, long, default_value = "brick")]
+    range: RangeMode,
+    /// Whether bricks keep their active masks
+    #[arg(long, default_value = "auto")]
+    masks: Masks,
+    /// What to do with infinities and NaNs
+    #[arg(long, default_value = "refuse")]
+    nonfinite: NonFinite,
+    /// zstd level of the file, 0 to store everything raw
+    #[arg(long, value_name = "LEVEL", default_value_t = DEFAULT_ZSTD, value_parser = clap::value_parser!(i32).range(0..=22))]
+    zstd: i32,
+    /// Frames per second, for engines that play the pack
+    #[arg(long, value_name = "RATE", value_parser = positive)]
+    fps: Option<f32>,
+}
+
+fn positive(text: &str) -> std::result::Result<f32, String> {
+    match text.parse() {
+        Ok(v) if v > 0.0 && f32::is_finite(v) => Ok(v),
+        _ => Err("a number above 0".to_owned()),
+    }
+}
+
+impl SettingsArgs {
+    fn settings(&self) -> Settings {
+        Settings {
+            grids: self.grids.clone(),
+            format: self.format,
+            range: self.range,
+            masks: self.masks,
+            nonfinite: self.nonfinite,
+            zstd: self.zstd,
+            fps: self.fps,
+        }
+    }
+}
+
+/// How much a pack is checked, as the command line has it.
+#[derive(Args)]
+struct VerifyArg {
+    /// How much of the finished pack is checked
+    #[arg(long, value_name = "LEVEL", default_value = "voxels")]
+    verify: VerifyLevel,
+}
+
+/// Runs the command that the arguments ask for.
+///
+/// # Errors
+/// What the command failed with; its [`Error::exit_code`] is the process's.
+pub fn run(cli: Cli) -> Result<()> {
+    if let Some(threads) = cli.common.threads {
+        rayon::ThreadPoolBuilder::new()
+            .num_threads(threads.into())
+            .build_global()
+            .map_err(|e| Error::Usage(format!("--threads {threads}: {e}")))?;
+    }
+    match cli.command {
+        Command::Build(args) => build::run(&args, cli.common),
+        Command::Inspect(args) => inspect::run(&args),
+        Command::Verify(args) => verify::run(&args, cli.common),
+    }
+}
+
+/// Prints an error whole, and where it may help how to go on.
+pub fn print_error(error: &Error) {
+    let style = style::ERROR;
+    anstream::eprintln!("{style}error{style:#}: {error}");
+}
+
+/// Expands globs that the shell did not.
+fn files(patterns: &[PathBuf]) -> Result<Vec<PathBuf>> {
+    crate::manifest::expand(patterns)
+}
+
+fn print_json(value: &impl serde::Serialize) {
+    let text = serde_json::to_string_pretty(value).expect("reports have string keys and finite numbers");
+    anstream::println!("{text}");
+}

@@ -1,0 +1,24 @@
+//! Colours, and numbers for people. `anstream` drops colours where there is no terminal or `NO_COLOR`
+//! is set.
+
+use anstyle::{AnsiColor, Style};
+
+pub const ERROR: Style = AnsiColor::Red.on_default().bold();
+pub const WARNING: Style = AnsiColor::Yellow.on_default().bold();
+pub const GOOD: Style = AnsiColor::Green.on_default();
+pub const TITLE: Style = Style::new().bold();
+
+/// 1,234,567.
+pub fn count(n: u64) -> String {
+    indicatif::HumanCount(n).to_string()
+}
+
+/// 1.23 MiB.
+pub fn bytes(n: u64) -> String {
+    indicatif::BinaryBytes(n).to_string()
+}
+
+/// A PSNR, or that there is no error.
+pub fn psnr(psnr: Option<f64>) -> String {
+    psnr.map_or_else(|| "exact".to_owned(), |db| format!("{db:.2} dB"))
+}

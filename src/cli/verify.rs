@@ -1,0 +1,127 @@
+//! `volpack verify`.
+
+use std::path::{Path, PathBuf};
+
+use clap::{Args, ValueEnum};
+use serde_json::json;
+
+use super::progress::Reporter;
+use super::style::{ERROR, GOOD, TITLE, psnr};
+use super::{Common, files, print_json};
+use crate::error::{Error, Result};
+use crate::manifest::{DEFAULT_NAME, Manifest, expand};
+use crate::pipeline::{Progress, check_structure};
+use crate::verify::{self, VerifyReport};
+
+#[derive(Args)]
+pub struct VerifyArgs {
+    /// The pack
+    pack: PathBuf,
+    /// The files that it was made from; without them the manifest is asked
+    #[arg(long, value_name = "FILES", num_args = 1..)]
+    source: Vec<PathBuf>,
+    /// The manifest that says where the sources are
+    #[arg(short, long, value_name = "FILE", default_value = DEFAULT_NAME)]
+    manifest: PathBuf,
+    /// How much is checked
+    #[arg(long, value_name = "RING", default_value = "voxels")]
+    level: Level,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, PartialEq, ValueEnum)]
+enum Level {
+    /// Digests, offsets, indices and counts: needs no source
+    Structure,
+    /// Those, and every voxel against the source
+    Voxels,
+}
+
+pub fn run(args: &VerifyArgs, common: Common) -> Result<()> {
+    let pack = check_structure(&args.pack)?;
+    if args.level == Level::Structure {
+        if args.json {
+            print_json(&json!({ "ok": true }));
+        } else if !common.quiet {
+            anstream::println!("{TITLE}{}{TITLE:#}: structure {GOOD}ok{GOOD:#}", args.pack.display());
+        }
+        return Ok(());
+    }
+    let sources = if args.source.is_empty() { sources_in_manifest(args)? } else { files(&args.source)? };
+    let mut reporter = Reporter::new("verify", common.quiet || args.json);
+    reporter.stage("voxels", sources.len() as u64);
+    let report = verify::voxels(&pack, &sources, |frames| reporter.advance(frames));
+    reporter.finish();
+    let report = report?;
+    if args.json {
+        print_json(&report);
+    } else if !common.quiet {
+        anstream::println!("{TITLE}{}{TITLE:#}", args.pack.display());
+        print_summary(&report);
+        if common.verbose {
+            print_frames(&report);
+        }
+    }
+    verdict(&args.pack, &report)
+}
+
+/// An error if a report has failures, with all of them.
+pub fn verdict(pack: &Path, report: &VerifyReport) -> Result<()> {
+    if report.ok {
+        return Ok(());
+    }
+    Err(Error::Verify(format!(
+        "{} does not say what its source says:\n  {}",
+        pack.display(),
+        report.failures.join("\n  ")
+    )))
+}
+
+fn sources_in_manifest(args: &VerifyArgs) -> Result<Vec<PathBuf>> {
+    let unknown = || {
+        Error::Usage(format!(
+            "{}: which files was it made from? Give --source FILES, or a manifest that builds it with -m",
+            args.pack.display()
+        ))
+    };
+    if !args.manifest.exists() {
+        return Err(unknown());
+    }
+    let manifest = Manifest::read(&args.manifest)?;
+    let pack = args.pack.canonicalize().map_err(Error::io(&args.pack))?;
+    let asset = manifest.assets.values().find(|a| a.output.canonicalize().is_ok_and(|output| output == pack));
+    expand(&asset.ok_or_else(unknown)?.frames)
+}
+
+/// The lines that say how near a pack is to its source.
+pub fn print_summary(report: &VerifyReport) {
+    let verdict = if report.ok { format!("{GOOD}ok{GOOD:#}") } else { format!("{ERROR}failed{ERROR:#}") };
+    anstream::println!("  verified against its source: {verdict}");
+    for grid in &report.grids {
+        let m = &grid.active;
+        let flips = if m.sign_flips > 0 { format!(", {} sign flips", m.sign_flips) } else { String::new() };
+        let error = if m.max_error > 0.0 {
+            format!(", RMSE {:.3e}, largest error {:.3e} of {:.3e}", m.rmse, m.max_error, grid.peak)
+        } else {
+            String::new()
+        };
+        anstream::println!("    {:12} {}{error}{flips}", grid.grid, psnr(m.psnr));
+    }
+    if let (Some(worst), true) = (&report.worst_frame, report.frames.len() > 1) {
+        anstream::println!("    worst frame  {} of {}: {:.2} dB", worst.frame, worst.grid, worst.psnr);
+    }
+}
+
+fn print_frames(report: &VerifyReport) {
+    for frame in &report.frames {
+        anstream::println!(
+            "      {:12} frame {:5}  {:>10}  largest error {:.3e}",
+            frame.grid,
+            frame.frame,
+            psnr(frame.active.psnr),
+            frame.active.max_error
+        );
+    }
+}

@@ -1,0 +1,104 @@
+//! What can go wrong, and the exit code of each kind.
+
+use std::path::{Path, PathBuf};
+
+use crate::codec::OutOfRange;
+use crate::pack::PackError;
+use crate::vdb::VdbError;
+
+/// Everything that a build, an inspection or a verification can fail with.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// The operating system refused.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// An OpenVDB file that cannot be used.
+    #[error("{}: {source}", path.display())]
+    Vdb {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: VdbError,
+    },
+    /// A pack that cannot be used.
+    #[error("{}: {source}", path.display())]
+    Pack {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        source: PackError,
+    },
+    /// A manifest that cannot be used.
+    #[error("{}: {message}", path.display())]
+    Manifest {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong, with its line.
+        message: String,
+    },
+    /// A request that makes no sense for the files at hand.
+    #[error("{0}")]
+    Usage(String),
+    /// Input that contradicts itself or cannot be packed.
+    #[error("{0}")]
+    Input(String),
+    /// Sound input of a kind that volpack does not pack.
+    #[error("{0}")]
+    Unsupported(String),
+    /// A value that the chosen format cannot hold.
+    #[error("grid {grid:?}: {source}")]
+    OutOfRange {
+        /// The grid.
+        grid: String,
+        /// The value.
+        source: OutOfRange,
+    },
+    /// A pack that does not say what its source says.
+    #[error("{0}")]
+    Verify(String),
+}
+
+/// `Result` with an [`Error`].
+pub type Result<T, E = Error> = std::result::Result<T, E>;
+
+impl Error {
+    /// Wraps what the operating system said of `path`.
+    pub fn io(path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.into();
+        move |source| Self::Io { path, source }
+    }
+
+    /// Wraps what is wrong with the OpenVDB file at `path`.
+    pub fn vdb(path: &Path) -> impl FnOnce(VdbError) -> Self {
+        let path = path.to_owned();
+        move |source| Self::Vdb { path, source }
+    }
+
+    /// Wraps what is wrong with the pack at `path`.
+    pub fn pack(path: &Path) -> impl FnOnce(PackError) -> Self {
+        let path = path.to_owned();
+        move |source| Self::Pack { path, source }
+    }
+
+    /// The process's exit code for this kind of failure, as `volpack help` lists them.
+    pub fn exit_code(&self) -> u8 {
+        match self {
+            Self::Io { source, .. } => match source.kind() {
+                std::io::ErrorKind::NotFound | std::io::ErrorKind::PermissionDenied => 3,
+                _ => 1,
+            },
+            Self::Usage(_) => 2,
+            Self::Vdb { source, .. } if source.is_unsupported() => 6,
+            Self::Pack { source, .. } if source.is_unsupported() => 6,
+            Self::Vdb { .. } | Self::Pack { .. } | Self::Manifest { .. } | Self::Input(_) => 3,
+            Self::OutOfRange { .. } => 3,
+            Self::Verify(_) => 4,
+            Self::Unsupported(_) => 6,
+        }
+    }
+}

@@ -1,0 +1,235 @@
+//! Reads one frame back: from coordinates to regions, from L3 records to voxels.
+
+use std::borrow::Cow;
+use std::collections::HashMap;
+
+use super::tree::{self, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS, header, l1_words};
+use super::{Frame, Grid, Pack, PackError};
+use crate::codec::{BrickRange, Codec, decode};
+use crate::volume::{BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, InactiveRule, Mask512, ROOT_DIM};
+
+/// The deepest thing that the tree has at some place.
+#[derive(Clone, Copy, Debug)]
+pub enum Region {
+    /// Inactive background.
+    Background,
+    /// One value.
+    Constant(Constant),
+    /// The 8³ region of a record.
+    Brick(L3Record),
+}
+
+/// A brick as a GPU reads it.
+pub struct DecodedBrick {
+    /// Every voxel's value, x slowest.
+    pub values: Box<[f32; BRICK_VOXELS]>,
+    /// Which voxels are active.
+    pub active: Mask512,
+}
+
+/// One frame of one grid with the texel chunks that it lists, and no others.
+pub struct FrameReader<'a> {
+    pack: &'a Pack,
+    grid: usize,
+    frame: usize,
+    slabs: HashMap<usize, Cow<'a, [u8]>>,
+}
+
+impl Pack {
+    /// Loads one frame's texels.
+    ///
+    /// # Errors
+    /// When a chunk is damaged or is not texels.
+    ///
+    /// # Panics
+    /// When there is no such frame.
+    pub fn frame(&self, grid: usize, frame: usize) -> Result<FrameReader<'_>, PackError> {
+        let mut slabs = HashMap::new();
+        let wanted = &self.grids[grid].frames[frame].chunks;
+        for atlas in &self.atlases {
+            for slab in 0..atlas.slabs {
+                let (_, chunk) = self.slab_chunk(atlas.codec, slab).expect("the atlas was checked");
+                if wanted.binary_search(&(chunk as u32)).is_ok() {
+                    slabs.insert(chunk, self.slab(atlas.codec, slab)?);
+                }
+            }
+        }
+        if slabs.len() != wanted.len() {
+            return Err(PackError::Corrupt(format!("frame {frame} lists chunks that are not texels")));
+        }
+        Ok(FrameReader { pack: self, grid, frame, slabs })
+    }
+
+    /// One frame's tree without its texels: regions can be found, bricks not decoded.
+    pub fn frame_tree(&self, grid: usize, frame: usize) -> FrameReader<'_> {
+        FrameReader { pack: self, grid, frame, slabs: HashMap::new() }
+    }
+}
+
+impl FrameReader<'_> {
+    /// The frame's grid.
+    pub fn grid(&self) -> &Grid {
+        &self.pack.grids[self.grid]
+    }
+
+    /// The frame.
+    pub fn frame(&self) -> &Frame {
+        &self.grid().frames[self.frame]
+    }
+
+    fn words(&self) -> &[u32] {
+        &self.pack.tree
+    }
+
+    fn constant(&self, index: u32, active: bool) -> Constant {
+        let words = self.words();
+        tree::constant(words[words[header::CONSTANT_AT] as usize + index as usize], active)
+    }
+
+    /// What the tree has at a voxel, and the side of the aligned cube around it that all is that.
+    pub fn locate(&self, at: Coord) -> (Region, i32) {
+        let grid = self.grid();
+        let mut root = 0usize;
+        let mut cell = 0usize;
+        for a in 0..3 {
+            let offset = i64::from(at.0[a]) - i64::from(grid.origin.0[a]);
+            let (cells, roots) = (i64::from(grid.cells[a]), i64::from(grid.roots[a]));
+            let index = offset.div_euclid(CELL_DIM.into());
+            if index < 0 || index >= cells * roots {
+                return (Region::Background, ROOT_DIM);
+            }
+            root = root * roots as usize + (index / cells) as usize;
+            cell = cell * cells as usize + (index % cells) as usize;
+        }
+        let roots: usize = grid.roots.iter().map(|r| *r as usize).product();
+        let words = self.words();
+        let l1 = match Link::from_word(words[grid.root_at + self.frame * roots + root]) {
+            Link::Node(0) => return (Region::Background, ROOT_DIM),
+            Link::Constant { index, active } => {
+                return (Region::Constant(self.constant(index, active)), ROOT_DIM);
+            }
+            Link::Node(l1) => l1 as usize,
+        };
+        let (mask_words, rank_words) = l1_words(grid.cells.iter().product::<u32>() as usize);
+        let (mask, rest) = words[l1..].split_at(mask_words);
+        let Some(rank) = tree::rank(mask, rest, cell) else { return (Region::Background, CELL_DIM) };
+        match Link::from_word(rest[rank_words + rank as usize]) {
+            Link::Constant { index, active } => (Region::Constant(self.constant(index, active)), CELL_DIM),
+            Link::Node(node) => (self.child(node, at.child_index(4, BRICK_DIM)), BRICK_DIM),
+        }
+    }
+
+    fn child(&self, node: u32, index: usize) -> Region {
+        let words = self.words();
+        let node = &words[words[header::NODE_AT] as usize + node as usize * NODE_WORDS..][..NODE_WORDS];
+        match tree::rank(&node[..128], &node[128..192], index) {
+            None => Region::Background,
+            Some(rank) => self.record(node[192] + rank),
+        }
+    }
+
+    fn record(&self, index: u32) -> Region {
+        let words = self.words();
+        let at = words[header::RECORD_AT] as usize + index as usize * RECORD_WORDS;
+        let record = L3Record::from_words([words[at], words[at + 1], words[at + 2]]);
+        Region::Brick(record.expect("records were checked when the pack was opened"))
+    }
+
+    /// Calls `visit` with every region that is not background: its smallest corner, its side in
+    /// voxels, and what it is.
+    pub fn for_each_region(&self, mut visit: impl FnMut(Coord, i32, Region)) {
+        let grid = self.grid();
+        let words = self.words();
+        let [rx, ry, rz] = grid.roots;
+        let [cx, cy, cz] = grid.cells.map(|c| c as i32);
+        let roots = (0..rx).flat_map(|x| (0..ry).flat_map(move |y| (0..rz).map(move |z| [x, y, z])));
+        let root_count = (rx * ry * rz) as usize;
+        for (i, root) in roots.enumerate() {
+            let origin = grid.origin.offset_by(std::array::from_fn(|a| root[a] as i32 * ROOT_DIM));
+            let l1 = match Link::from_word(words[grid.root_at + self.frame * root_count + i]) {
+                Link::Node(0) => continue,
+                Link::Constant { index, active } => {
+                    visit(origin, ROOT_DIM, Region::Constant(self.constant(index, active)));
+                    continue;
+                }
+                Link::Node(l1) => l1 as usize,
+            };
+            let (mask_words, rank_words) = l1_words((cx * cy * cz) as usize);
+            let links = &words[l1 + mask_words + rank_words..];
+            let cells = set_bits(&words[l1..l1 + mask_words]);
+            for (&link, cell) in links.iter().zip(cells) {
+                let cell = cell as i32;
+                let cell = [cell / (cy * cz), cell / cz % cy, cell % cz];
+                let origin = origin.offset_by(cell.map(|c| c * CELL_DIM));
+                match Link::from_word(link) {
+                    Link::Constant { index, active } => {
+                        visit(origin, CELL_DIM, Region::Constant(self.constant(index, active)));
+                    }
+                    Link::Node(node) => self.for_each_child(node, origin, &mut visit),
+                }
+            }
+        }
+    }
+
+    fn for_each_child(&self, node: u32, origin: Coord, visit: &mut impl FnMut(Coord, i32, Region)) {
+        let words = self.words();
+        let node = &words[words[header::NODE_AT] as usize + node as usize * NODE_WORDS..][..NODE_WORDS];
+        for (record, place) in (node[192]..).zip(set_bits(&node[..128])) {
+            visit(origin.offset_by(Coord::child_offset(place, 4, BRICK_DIM)), BRICK_DIM, self.record(record));
+        }
+    }
+
+    fn mask(&self, index: u32) -> Mask512 {
+        let words = self.words();
+        let at = words[header::MASK_AT] as usize + index as usize * MASK_WORDS;
+        Mask512::from_words(words[at..at + MASK_WORDS].try_into().expect("16 words"))
+    }
+
+    /// Decodes a record's 512 voxels.
+    ///
+    /// # Errors
+    /// When its texels are not among the chunks that the frame lists.
+    pub fn decode(&self, record: &L3Record) -> Result<DecodedBrick, PackError> {
+        let grid = self.grid();
+        let mut values = if record.codec == Codec::Constant {
+            Box::new([f32::from_bits(record.word2); BRICK_VOXELS])
+        } else {
+            let range = BrickRange::from_word(record.word2);
+            decode(record.codec, &self.texels(record)?, record.axis, &grid.sequence, range)
+        };
+        let background = grid.background;
+        let Some(index) = record.mask else {
+            let mut active = Mask512::NONE;
+            (0..BRICK_VOXELS).filter(|&i| values[i] != background).for_each(|i| active.set(i));
+            return Ok(DecodedBrick { values, active });
+        };
+        let active = self.mask(index);
+        let minus = match record.rule {
+            InactiveRule::Texel => return Ok(DecodedBrick { values, active }),
+            InactiveRule::Background => Mask512::NONE,
+            InactiveRule::MinusBackground => Mask512::ALL,
+            InactiveRule::Sign => self.mask(index + 1),
+        };
+        for i in (0..BRICK_VOXELS).filter(|&i| !active.get(i)) {
+            values[i] = if minus.get(i) { -background } else { background };
+        }
+        Ok(DecodedBrick { values, active })
+    }
+
+    fn texels(&self, record: &L3Record) -> Result<Vec<u8>, PackError> {
+        let atlas = self.pack.atlas(record.codec).expect("records were checked when the pack was opened");
+        let (slab, place) = (record.slot / atlas.slab_bricks(), record.slot % atlas.slab_bricks());
+        let loaded = self.pack.slab_chunk(record.codec, slab).and_then(|(_, chunk)| self.slabs.get(&chunk));
+        let slab = loaded.ok_or_else(|| {
+            PackError::Corrupt(format!("frame {} does not list the chunk of a brick it uses", self.frame))
+        })?;
+        Ok(atlas.extract(slab, place))
+    }
+}
+
+fn set_bits(words: &[u32]) -> impl Iterator<Item = usize> + '_ {
+    words
+        .iter()
+        .enumerate()
+        .flat_map(|(i, &word)| (0..32).filter(move |b| word >> b & 1 != 0).map(move |b| i * 32 + b))
+}

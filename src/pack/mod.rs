@@ -1,0 +1,20 @@
+//! The `.volpack` file format: layout, writer, reader, structural checks, decoder.
+//!
+//! `docs/format.md` is the specification.
+
+mod atlas;
+mod check;
+mod decode;
+mod error;
+pub mod layout;
+mod provenance;
+mod reader;
+pub mod tree;
+mod writer;
+
+pub use atlas::{Atlas, MAX_TEXELS};
+pub use decode::{DecodedBrick, FrameReader, Region};
+pub use error::PackError;
+pub use provenance::{Provenance, Source};
+pub use reader::{Frame, Grid, Pack};
+pub use writer::{PackWriter, SectionSpec, compress_chunk};

@@ -1,0 +1,35 @@
+//! Where a pack comes from: one JSON section, for people and for `verify`.
+
+use serde::{Deserialize, Serialize};
+
+use crate::settings::Settings;
+
+/// What made a pack, out of what. No paths and no times: the same input gives the same bytes.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Provenance {
+    /// `volpack`.
+    pub tool: String,
+    /// Its version.
+    pub version: String,
+    /// The instruction set of the block encoder, whose blocks depend on it; absent where no block
+    /// format is used.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub encoder_isa: Option<String>,
+    /// The settings that the bytes depend on.
+    pub settings: Settings,
+    /// The source files, in the order of their frames.
+    pub sources: Vec<Source>,
+}
+
+/// One source file.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Source {
+    /// Its name without its folder.
+    pub file: String,
+    /// Its frame number.
+    pub frame: i32,
+    /// Its length.
+    pub bytes: u64,
+    /// BLAKE3 of its bytes, in hexadecimal.
+    pub blake3: String,
+}

@@ -1,0 +1,224 @@
+//! Writes a pack beside its final place and renames it when it is whole.
+
+use std::fs::File;
+use std::io::{self, BufWriter, Seek, SeekFrom, Write};
+use std::path::{Path, PathBuf};
+
+use tempfile::NamedTempFile;
+
+use super::layout::{ALIGNMENT, Chunk, Header, MAGIC, Section, VERSION, encoding};
+
+/// A section that will be written: everything that is known before its bytes are.
+#[derive(Clone, Copy, Debug)]
+pub struct SectionSpec {
+    /// One of [`super::layout::kind`].
+    pub kind: u32,
+    /// The codec tag of a texel section, else 0.
+    pub codec: u32,
+    /// One of [`encoding`].
+    pub encoding: u32,
+    /// Raw bytes of a chunk.
+    pub chunk_bytes: u32,
+    /// Raw bytes of the section.
+    pub raw_bytes: u64,
+}
+
+/// A chunk as it will lie in the file.
+pub struct StoredChunk {
+    bytes: Vec<u8>,
+    raw_bytes: u32,
+    digest: [u8; 32],
+}
+
+/// Encodes one chunk. What does not shrink is stored raw. `level` is zstd's.
+///
+/// # Errors
+/// When zstd fails, which it does for want of memory only.
+pub fn compress_chunk(raw: Vec<u8>, encoding: u32, level: i32) -> io::Result<StoredChunk> {
+    let raw_bytes = u32::try_from(raw.len()).expect("chunks are about 256 KiB");
+    let bytes = if encoding == encoding::RAW {
+        raw
+    } else {
+        let packed = match encoding::shuffle_width(encoding) {
+            1 => zstd::bulk::compress(&raw, level)?,
+            width => zstd::bulk::compress(&shuffle(&raw, width), level)?,
+        };
+        if packed.len() < raw.len() { packed } else { raw }
+    };
+    let digest = *blake3::hash(&bytes).as_bytes();
+    Ok(StoredChunk { bytes, raw_bytes, digest })
+}
+
+/// Gathers the first bytes of all words, then the second bytes, and so on. Bytes past the last whole
+/// word stay at the end.
+pub(super) fn shuffle(raw: &[u8], width: usize) -> Vec<u8> {
+    let words = raw.len() / width;
+    let mut out = Vec::with_capacity(raw.len());
+    for plane in 0..width {
+        out.extend(raw[..words * width].iter().skip(plane).step_by(width));
+    }
+    out.extend(&raw[words * width..]);
+    out
+}
+
+/// Writes sections one after another, in the order in which they were announced.
+pub struct PackWriter {
+    out: BufWriter<NamedTempFile>,
+    path: PathBuf,
+    specs: Vec<SectionSpec>,
+    sections: Vec<Section>,
+    chunks: Vec<Chunk>,
+    chunk_total: usize,
+    at: u64,
+}
+
+impl PackWriter {
+    /// Begins a pack that will be at `path`. Nothing is there before [`PackWriter::finish`].
+    ///
+    /// # Errors
+    /// When no file can be made beside `path`.
+    pub fn create(path: &Path, specs: Vec<SectionSpec>) -> io::Result<Self> {
+        let folder = match path.parent() {
+            Some(folder) if folder != Path::new("") => folder,
+            _ => Path::new("."),
+        };
+        std::fs::create_dir_all(folder)?;
+        let file = tempfile::Builder::new().prefix(".volpack-").tempfile_in(folder)?;
+        let chunk_total = specs.iter().map(|s| s.raw_bytes.div_ceil(s.chunk_bytes.into()) as usize).sum();
+        let tables =
+            size_of::<Header>() + specs.len() * size_of::<Section>() + chunk_total * size_of::<Chunk>();
+        let mut writer = Self {
+            out: BufWriter::with_capacity(1 << 20, file),
+            path: path.to_owned(),
+            sections: Vec::with_capacity(specs.len()),
+            specs,
+            chunks: Vec::with_capacity(chunk_total),
+            chunk_total,
+            at: 0,
+        };
+        writer.zeros(tables as u64)?;
+        Ok(writer)
+    }
+
+    fn zeros(&mut self, count: u64) -> io::Result<()> {
+        io::copy(&mut io::Read::take(io::repeat(0), count), &mut self.out)?;
+        self.at += count;
+        Ok(())
+    }
+
+    /// Begins the next announced section. Its chunks follow.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn begin(&mut self) -> io::Result<()> {
+        let spec = self.specs[self.sections.len()];
+        self.zeros(self.at.next_multiple_of(ALIGNMENT) - self.at)?;
+        self.sections.push(Section {
+            kind: spec.kind,
+            codec: spec.codec,
+            encoding: spec.encoding,
+            chunk_bytes: spec.chunk_bytes,
+            first_chunk: self.chunks.len() as u32,
+            chunks: 0,
+            offset: self.at,
+            stored_bytes: 0,
+            raw_bytes: 0,
+            digest: [0; 32],
+        });
+        Ok(())
+    }
+
+    /// Writes the next chunk of the section that was begun last.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn chunk(&mut self, chunk: &StoredChunk) -> io::Result<()> {
+        self.out.write_all(&chunk.bytes)?;
+        let stored = chunk.bytes.len() as u32;
+        self.chunks.push(Chunk {
+            offset: self.at,
+            stored_bytes: stored,
+            raw_bytes: chunk.raw_bytes,
+            digest: chunk.digest,
+        });
+        self.at += u64::from(stored);
+        let section = self.sections.last_mut().expect("a section was begun");
+        section.chunks += 1;
+        section.stored_bytes += u64::from(stored);
+        section.raw_bytes += u64::from(chunk.raw_bytes);
+        Ok(())
+    }
+
+    /// Writes the next announced section whole.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn section(&mut self, raw: &[u8], level: i32) -> io::Result<()> {
+        self.begin()?;
+        let spec = self.specs[self.sections.len() - 1];
+        for chunk in raw.chunks(spec.chunk_bytes as usize) {
+            self.chunk(&compress_chunk(chunk.to_vec(), spec.encoding, level)?)?;
+        }
+        Ok(())
+    }
+
+    /// Fills in the tables, syncs, and moves the file to its place. Returns its length.
+    ///
+    /// # Errors
+    /// When the file cannot be written or renamed.
+    ///
+    /// # Panics
+    /// When what was written is not what was announced.
+    pub fn finish(mut self) -> io::Result<u64> {
+        assert_eq!(self.sections.len(), self.specs.len(), "every announced section is written");
+        assert_eq!(self.chunks.len(), self.chunk_total, "every announced chunk is written");
+        for (section, spec) in self.sections.iter_mut().zip(&self.specs) {
+            assert_eq!(section.raw_bytes, spec.raw_bytes, "section {} is as long as announced", spec.kind);
+            let first = section.first_chunk as usize;
+            let entries = &self.chunks[first..first + section.chunks as usize];
+            section.digest = *blake3::hash(bytemuck::cast_slice(entries)).as_bytes();
+        }
+        let mut header = Header {
+            magic: MAGIC,
+            major: VERSION,
+            minor: 0,
+            sections: self.sections.len() as u32,
+            chunks: self.chunks.len() as u32,
+            reserved: 0,
+            file_bytes: self.at,
+            digest: [0; 32],
+        };
+        header.digest = tables_digest(&header, &self.sections, &self.chunks);
+
+        self.out.seek(SeekFrom::Start(0))?;
+        self.out.write_all(bytemuck::bytes_of(&header))?;
+        self.out.write_all(bytemuck::cast_slice(&self.sections))?;
+        self.out.write_all(bytemuck::cast_slice(&self.chunks))?;
+        let file = self.out.into_inner().map_err(io::IntoInnerError::into_error)?;
+        file.as_file().sync_all()?;
+        make_readable(file.as_file())?;
+        file.persist(&self.path).map_err(|e| e.error)?;
+        Ok(self.at)
+    }
+}
+
+/// BLAKE3 of the tables with the header's digest zero.
+pub(super) fn tables_digest(header: &Header, sections: &[Section], chunks: &[Chunk]) -> [u8; 32] {
+    let header = Header { digest: [0; 32], ..*header };
+    let mut hasher = blake3::Hasher::new();
+    hasher.update(bytemuck::bytes_of(&header));
+    hasher.update(bytemuck::cast_slice(sections));
+    hasher.update(bytemuck::cast_slice(chunks));
+    *hasher.finalize().as_bytes()
+}
+
+/// Temporary files are made for their owner alone; a pack is for everyone, as any other output.
+fn make_readable(file: &File) -> io::Result<()> {
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt;
+        file.set_permissions(std::fs::Permissions::from_mode(0o644))?;
+    }
+    let _ = file;
+    Ok(())
+}

@@ -1,0 +1,271 @@
+//! Strings the stages together.
+
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use rayon::prelude::*;
+
+use crate::error::{Error, Result};
+use crate::pack::{Pack, Provenance, Source};
+use crate::settings::{Format, Masks, Settings};
+use crate::stages::allocate::allocate;
+use crate::stages::dedup::{DedupError, MaskPolicy, SequenceTree};
+use crate::stages::flatten::{Flattened, flatten};
+use crate::stages::metadata::{self, FrameSource, SequenceInfo};
+use crate::stages::quantise::QuantiseError;
+use crate::stages::select::{SelectedGrid, Selection, find, select};
+use crate::stages::serialise::{FrameInput, GridInput, SerialiseError, serialise};
+use crate::vdb::{GridClass, VdbFile};
+use crate::verify::{self, VerifyReport};
+
+/// How much a finished pack is checked.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, clap::ValueEnum)]
+pub enum VerifyLevel {
+    /// Not at all
+    None,
+    /// Digests, offsets, indices and counts
+    Structure,
+    /// Those, and every voxel against the source
+    #[default]
+    Voxels,
+}
+
+/// One pack to build.
+#[derive(Clone, Debug)]
+pub struct Job {
+    /// The source files.
+    pub frames: Vec<PathBuf>,
+    /// Where the pack goes.
+    pub output: PathBuf,
+    /// How it is made.
+    pub settings: Settings,
+    /// Whether warnings are errors.
+    pub strict: bool,
+    /// How much is checked afterwards.
+    pub verify: VerifyLevel,
+}
+
+/// Hears how a build is getting on. Called from one thread at a time.
+pub trait Progress {
+    /// A stage begins, which has that many steps.
+    fn stage(&mut self, name: &'static str, steps: u64);
+    /// That many more steps of the stage are done.
+    fn advance(&mut self, steps: u64);
+    /// Something is odd but does not stop the build.
+    fn warn(&mut self, warning: &str);
+}
+
+/// Progress that nobody hears of.
+pub struct Silent;
+
+impl Progress for Silent {
+    fn stage(&mut self, _: &'static str, _: u64) {}
+    fn advance(&mut self, _: u64) {}
+    fn warn(&mut self, _: &str) {}
+}
+
+/// What a build did.
+pub struct Outcome {
+    /// What was odd.
+    pub warnings: Vec<String>,
+    /// Seconds by stage, in order.
+    pub seconds: Vec<(&'static str, f64)>,
+    /// What verification found, if voxels were compared.
+    pub verification: Option<VerifyReport>,
+}
+
+/// Builds one pack, and verifies it as the job asks.
+///
+/// # Errors
+/// The first thing that is wrong, with its file and grid. Nothing is left at the output then but
+/// what was there before, unless only verification failed.
+pub fn build(job: &Job, progress: &mut dyn Progress) -> Result<Outcome> {
+    let mut clock = Clock::new();
+    progress.stage("metadata", job.frames.len() as u64);
+    let sequence = metadata::read(&job.frames)?;
+    let selection = select(&sequence, &job.settings.grids)?;
+    let warnings = [&sequence.warnings[..], &selection.warnings].concat();
+    for warning in &warnings {
+        if job.strict {
+            return Err(Error::Input(format!("{warning} (an error because of --strict)")));
+        }
+        progress.warn(warning);
+    }
+    clock.lap("metadata");
+
+    progress.stage("flatten", sequence.frames.len() as u64);
+    let trees = flatten_and_dedup(&sequence, &selection, &job.settings, progress)?;
+    clock.lap("flatten and dedup");
+
+    let mut grids = selection
+        .grids
+        .iter()
+        .zip(trees)
+        .map(|(grid, tree)| grid_input(&sequence, grid, tree, &job.settings))
+        .collect::<Result<Vec<_>>>()?;
+    let provenance = provenance(&sequence, &job.settings);
+    let bricks: u64 = grids.iter().map(|g| u64::from(g.tree.pool.len())).sum();
+    progress.stage("encode", bricks);
+    let level = (job.settings.zstd != 0).then_some(job.settings.zstd);
+    serialise(&job.output, &mut grids, &provenance, level, |bricks| progress.advance(bricks))
+        .map_err(|e| serialise_error(e, &grids, &job.output))?;
+    clock.lap("encode and serialise");
+
+    let verification = match job.verify {
+        VerifyLevel::None => None,
+        VerifyLevel::Structure => {
+            check_structure(&job.output)?;
+            None
+        }
+        VerifyLevel::Voxels => {
+            let pack = check_structure(&job.output)?;
+            progress.stage("verify", sequence.frames.len() as u64);
+            Some(verify::voxels(&pack, &job.frames, |frames| progress.advance(frames))?)
+        }
+    };
+    clock.lap("verify");
+    Ok(Outcome { warnings, seconds: clock.laps, verification })
+}
+
+/// Opens a pack and checks every byte of it that can be checked without its source.
+///
+/// # Errors
+/// [`Error::Pack`].
+pub fn check_structure(path: &Path) -> Result<Pack> {
+    let pack = Pack::open(path).map_err(Error::pack(path))?;
+    pack.check_chunks().map_err(Error::pack(path))?;
+    Ok(pack)
+}
+
+struct Clock {
+    last: Instant,
+    laps: Vec<(&'static str, f64)>,
+}
+
+impl Clock {
+    fn new() -> Self {
+        Self { last: Instant::now(), laps: Vec::new() }
+    }
+
+    fn lap(&mut self, name: &'static str) {
+        let now = Instant::now();
+        self.laps.push((name, (now - self.last).as_secs_f64()));
+        self.last = now;
+    }
+}
+
+/// Reads frames, as many at a time as there are threads, and adds them in order.
+fn flatten_and_dedup(
+    sequence: &SequenceInfo,
+    selection: &Selection,
+    settings: &Settings,
+    progress: &mut dyn Progress,
+) -> Result<Vec<SequenceTree>> {
+    let scratch = |e| Error::io(std::env::temp_dir())(e);
+    let mut trees = selection
+        .grids
+        .iter()
+        .map(|grid| SequenceTree::new(mask_policy(settings, grid.class)).map_err(scratch))
+        .collect::<Result<Vec<_>>>()?;
+    for window in sequence.frames.chunks(rayon::current_num_threads()) {
+        let flat: Vec<_> = window.par_iter().map(|f| flatten_frame(f, selection, settings)).collect();
+        for (frame, flat) in window.iter().zip(flat) {
+            for ((tree, grid), flat) in trees.iter_mut().zip(&selection.grids).zip(flat?) {
+                let Some(flat) = flat else { continue };
+                tree.add(flat).map_err(|e| match e {
+                    DedupError::Scratch { source } => scratch(source),
+                    DedupError::Background { .. } => Error::Input(format!(
+                        "{}: grid {:?}: {e}: export the whole sequence with one background",
+                        frame.path.display(),
+                        grid.name
+                    )),
+                })?;
+            }
+            progress.advance(1);
+        }
+    }
+    Ok(trees)
+}
+
+/// The selected grids of one file; `None` for those that it does not have.
+fn flatten_frame(
+    frame: &FrameSource,
+    selection: &Selection,
+    settings: &Settings,
+) -> Result<Vec<Option<Flattened>>> {
+    let file = VdbFile::open(&frame.path).map_err(Error::vdb(&frame.path))?;
+    let one = |grid: &SelectedGrid| {
+        let found = find(&file.grids, &grid.name);
+        found.map(|info| flatten(&file, &frame.path, info, settings.nonfinite)).transpose()
+    };
+    selection.grids.iter().map(one).collect()
+}
+
+fn mask_policy(settings: &Settings, class: GridClass) -> MaskPolicy {
+    match (settings.masks, settings.format, class) {
+        (Masks::Keep, ..) | (Masks::Auto, Format::F32, _) | (Masks::Auto, _, GridClass::LevelSet) => {
+            MaskPolicy::Keep
+        }
+        _ => MaskPolicy::DropWhereBackground,
+    }
+}
+
+fn grid_input(
+    sequence: &SequenceInfo,
+    grid: &SelectedGrid,
+    tree: SequenceTree,
+    settings: &Settings,
+) -> Result<GridInput> {
+    let frames = grid.frames.iter().map(|&i| {
+        let frame = &sequence.frames[i];
+        let info = find(&frame.grids, &grid.name).expect("the grid was selected in this frame");
+        let transform = info.transform.matrix.expect("the grid was selected for its linear map");
+        FrameInput { number: frame.number, source: i as u32, transform }
+    });
+    let allocation = allocate(&tree, settings.format, settings.range).ok_or_else(|| {
+        Error::Input(format!(
+            "grid {:?}: its values span more than an f32 can hold: scale the grid down before the export",
+            grid.name
+        ))
+    })?;
+    Ok(GridInput {
+        name: grid.name.clone(),
+        class: grid.class,
+        fps: settings.fps.unwrap_or(0.0),
+        frames: frames.collect(),
+        tree,
+        allocation,
+    })
+}
+
+fn provenance(sequence: &SequenceInfo, settings: &Settings) -> Provenance {
+    let uses_block_encoder = matches!(settings.format, Format::Bc4 | Format::Bc7);
+    Provenance {
+        tool: env!("CARGO_PKG_NAME").to_owned(),
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        encoder_isa: uses_block_encoder.then(|| crate::codec::encoder_isa().to_owned()),
+        settings: settings.clone(),
+        sources: sequence
+            .frames
+            .iter()
+            .map(|f| Source {
+                file: f.file_name(),
+                frame: f.number,
+                bytes: f.bytes,
+                blake3: f.digest.to_hex().to_string(),
+            })
+            .collect(),
+    }
+}
+
+fn serialise_error(error: SerialiseError, grids: &[GridInput], output: &Path) -> Error {
+    match error {
+        SerialiseError::Io(source) | SerialiseError::Quantise(QuantiseError::Io(source)) => {
+            Error::io(output)(source)
+        }
+        SerialiseError::Quantise(QuantiseError::OutOfRange { grid, source }) => {
+            Error::OutOfRange { grid: grids[grid].name.clone(), source }
+        }
+        SerialiseError::TooLarge { .. } => Error::Unsupported(error.to_string()),
+    }
+}

@@ -1,0 +1,102 @@
+//! A pack in figures.
+
+use std::collections::{BTreeMap, BTreeSet, HashSet};
+
+use serde::Serialize;
+
+use crate::codec::Codec;
+use crate::pack::tree::{MASK_WORDS, RECORD_WORDS, header};
+use crate::pack::{Pack, Region};
+
+/// A pack's sizes and counts.
+#[derive(Clone, Debug, Serialize)]
+pub struct PackSummary {
+    /// The grids' names.
+    pub grids: Vec<String>,
+    /// Distinct frame numbers.
+    pub frames: u64,
+    /// 8³ regions over all frames, shared ones counted each time.
+    pub bricks: u64,
+    /// Distinct 8³ regions.
+    pub unique_bricks: u64,
+    /// Distinct 8³ regions and their texels by codec.
+    pub codecs: BTreeMap<&'static str, CodecSummary>,
+    /// Bytes of the tree without masks.
+    pub tree_bytes: u64,
+    /// Bytes of masks.
+    pub mask_bytes: u64,
+    /// Bytes of texture pages.
+    pub texel_bytes: u64,
+    /// What a GPU has to hold: tree, masks and texels.
+    pub gpu_bytes: u64,
+    /// Bytes of the file.
+    pub file_bytes: u64,
+    /// GPU bits for each voxel of the source's leaves, before any sharing.
+    pub bits_per_voxel: f64,
+    /// Distinct L2 nodes.
+    pub l2_nodes: u64,
+    /// Leaves of the source over all frames.
+    pub source_leaves: u64,
+}
+
+/// The bricks of one codec.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct CodecSummary {
+    /// How many there are.
+    pub bricks: u64,
+    /// Bytes of their texture pages.
+    pub bytes: u64,
+}
+
+impl PackSummary {
+    /// Counts what is in a pack.
+    pub fn new(pack: &Pack) -> Self {
+        let words = &pack.tree;
+        let record_at = words[header::RECORD_AT] as usize;
+        let records = words[record_at..].chunks_exact(RECORD_WORDS).take(words[header::RECORDS] as usize);
+        let unique: HashSet<&[u32]> = records.collect();
+        let mut codecs: BTreeMap<&'static str, CodecSummary> = BTreeMap::new();
+        for record in &unique {
+            let codec = Codec::from_tag(record[0] & 7).expect("the pack was checked");
+            codecs.entry(codec.name()).or_default().bricks += 1;
+        }
+        for atlas in &pack.atlases {
+            codecs.entry(atlas.codec.name()).or_default().bytes = atlas.bytes();
+        }
+
+        let mut bricks = 0;
+        let mut frames = BTreeSet::new();
+        let mut source_leaves = 0;
+        for (g, grid) in pack.grids.iter().enumerate() {
+            for (f, frame) in grid.frames.iter().enumerate() {
+                frames.insert(frame.record.number);
+                source_leaves += frame.record.leaves;
+                let count = |_, _, region| bricks += u64::from(matches!(region, Region::Brick(_)));
+                pack.frame_tree(g, f).for_each_region(count);
+            }
+        }
+        let mask_bytes = u64::from(words[header::MASKS]) * MASK_WORDS as u64 * 4;
+        let tree_bytes = words.len() as u64 * 4 - mask_bytes;
+        let texel_bytes = pack.atlases.iter().map(crate::pack::Atlas::bytes).sum();
+        let gpu_bytes = tree_bytes + mask_bytes + texel_bytes;
+        Self {
+            grids: pack.grids.iter().map(|g| g.name.clone()).collect(),
+            frames: frames.len() as u64,
+            bricks,
+            unique_bricks: unique.len() as u64,
+            codecs,
+            tree_bytes,
+            mask_bytes,
+            texel_bytes,
+            gpu_bytes,
+            file_bytes: pack.file_bytes(),
+            bits_per_voxel: if source_leaves == 0 {
+                0.0
+            } else {
+                gpu_bytes as f64 * 8.0 / (512 * source_leaves) as f64
+            },
+            l2_nodes: words[header::NODES].into(),
+            source_leaves,
+        }
+    }
+}

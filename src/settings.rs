@@ -1,0 +1,110 @@
+//! What a build can be asked for: the words of the manifest, the command line and a pack's provenance.
+
+use clap::ValueEnum;
+use serde::{Deserialize, Serialize};
+
+use crate::codec::Codec;
+
+/// How the bricks of an asset are stored.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Format {
+    /// 32-bit floats, lossless
+    F32,
+    /// 16-bit floats, exact where the source is half
+    F16,
+    /// 8 bits a voxel
+    #[default]
+    Unorm8,
+    /// BC4 blocks, 4 bits a voxel
+    Bc4,
+    /// BC7 blocks, 2 bits a voxel
+    Bc7,
+}
+
+impl Format {
+    /// The codec of every brick that is not constant.
+    pub fn codec(self) -> Codec {
+        match self {
+            Self::F32 => Codec::F32,
+            Self::F16 => Codec::F16,
+            Self::Unorm8 => Codec::Unorm8,
+            Self::Bc4 => Codec::Bc4,
+            Self::Bc7 => Codec::Bc7,
+        }
+    }
+
+    /// Every format, finest first.
+    pub const ALL: [Self; 5] = [Self::F32, Self::F16, Self::Unorm8, Self::Bc4, Self::Bc7];
+}
+
+/// What the 0 and 1 of normalised texels stand for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum RangeMode {
+    /// The minimum and maximum of each brick
+    #[default]
+    Brick,
+    /// Those of the whole sequence, as in the Utrecht thesis
+    Sequence,
+}
+
+/// Whether bricks keep their active masks.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Masks {
+    /// Kept for level sets and for f32, else dropped from bricks whose inactive voxels are background
+    #[default]
+    Auto,
+    /// Kept everywhere
+    Keep,
+    /// Dropped from every brick whose inactive voxels are background
+    Drop,
+}
+
+/// What to do with voxels that are infinite or not a number.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum NonFinite {
+    /// Count them and fail the build
+    #[default]
+    Refuse,
+    /// Make them 0
+    Zero,
+}
+
+/// The zstd level of a pack where none is chosen: the level of zstd's own tool.
+pub const DEFAULT_ZSTD: i32 = 3;
+
+/// Everything that a pack's bytes depend on beside its sources.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Settings {
+    /// The grids to pack; none for the default one.
+    pub grids: Vec<String>,
+    /// How bricks are stored.
+    pub format: Format,
+    /// What normalised texels are fractions of.
+    pub range: RangeMode,
+    /// Whether bricks keep their masks.
+    pub masks: Masks,
+    /// What to do with infinities and NaNs.
+    pub nonfinite: NonFinite,
+    /// zstd's level, 1 to 22; 0 stores everything raw.
+    pub zstd: i32,
+    /// Frames per second.
+    pub fps: Option<f32>,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            grids: Vec::new(),
+            format: Format::default(),
+            range: RangeMode::default(),
+            masks: Masks::default(),
+            nonfinite: NonFinite::default(),
+            zstd: DEFAULT_ZSTD,
+            fps: None,
+        }
+    }
+}

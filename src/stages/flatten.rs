@@ -1,0 +1,203 @@
+//! Stage 3: one grid of one frame, from OpenVDB's tree to cells and bricks in absolute coordinates.
+
+use rayon::prelude::*;
+
+use crate::error::{Error, Result};
+use crate::settings::NonFinite;
+use crate::vdb::{GridInfo, Scalar, Tree, VdbFile, with_scalar_type};
+use crate::volume::{
+    Brick, CELL_DIM, Cell, CellContent, Child, Constant, Coord, FlatFrame, FrameStats, ValueRange,
+};
+
+/// A flattened frame, and the value outside everything in it.
+pub struct Flattened {
+    /// The frame.
+    pub frame: FlatFrame,
+    /// The grid's background as `f32`.
+    pub background: f32,
+}
+
+/// Reads one grid of an open file and flattens it. Values that are not `f32` become the nearest one.
+///
+/// # Errors
+/// When the tree cannot be read, or has infinities or NaNs and `nonfinite` refuses them.
+pub fn flatten(
+    file: &VdbFile,
+    path: &std::path::Path,
+    grid: &GridInfo,
+    nonfinite: NonFinite,
+) -> Result<Flattened> {
+    let flat = with_scalar_type!(&grid.value_type,
+        T => flatten_tree(&file.read_tree::<T>(grid).map_err(Error::vdb(path))?, nonfinite),
+        other => unreachable!("{} grids are refused when grids are selected", other.name())
+    );
+    let count = flat.frame.stats.nonfinite;
+    if count > 0 && nonfinite == NonFinite::Refuse {
+        let voxels = if count == 1 { "value that is" } else { "values that are" };
+        return Err(Error::Input(format!(
+            "{}: grid {:?} has {count} {voxels} infinite or not a number: \
+             repair the export, or set nonfinite = \"zero\"",
+            path.display(),
+            grid.name
+        )));
+    }
+    Ok(flat)
+}
+
+/// What becomes of a leaf.
+enum LeafKind {
+    /// All inactive background: nothing.
+    Background,
+    Constant(Constant),
+    Brick,
+}
+
+struct LeafSummary {
+    kind: LeafKind,
+    active_range: Option<ValueRange>,
+    nonfinite: u64,
+}
+
+fn flatten_tree<T: Scalar>(tree: &Tree<T>, nonfinite: NonFinite) -> Flattened {
+    let mut f = Flattener { background: 0.0, nonfinite_count: 0, nonfinite, active_range: None };
+    f.background = f.value(tree.background);
+    let background = f.background;
+
+    let summaries: Vec<LeafSummary> = (0..tree.leaves.len())
+        .into_par_iter()
+        .map(|i| summarise(&brick(tree, i, nonfinite), tree, i, background))
+        .collect();
+
+    let mut roots = Vec::new();
+    for tile in &tree.tiles {
+        roots.extend(f.tile(tile.value, tile.active).map(|c| (tile.origin, c)));
+    }
+    let mut cells = Vec::new();
+    let mut brick_leaves = Vec::new();
+    for l1 in &tree.l1 {
+        let mut l2 = l1.first_child;
+        for i in 0..l1.tiles.len() {
+            let content = if l1.is_child(i) {
+                let children = f.children(&tree.l2[l2], &summaries, &mut brick_leaves);
+                l2 += 1;
+                (!children.is_empty()).then_some(CellContent::Node(children))
+            } else {
+                f.tile(l1.tiles[i], l1.is_active(i)).map(CellContent::Constant)
+            };
+            let origin = l1.origin.offset_by(Coord::child_offset(i, 5, CELL_DIM));
+            cells.extend(content.map(|content| Cell { origin, content }));
+        }
+    }
+    let bricks = brick_leaves.par_iter().map(|&leaf| brick(tree, leaf, nonfinite)).collect();
+
+    let topology = tree.topology_stats();
+    let leaf_range = ValueRange::union_all(summaries.iter().filter_map(|s| s.active_range));
+    let stats = FrameStats {
+        leaves: topology.leaves,
+        active_voxels: topology.active_voxels,
+        bbox: topology.bbox,
+        active_range: ValueRange::union_all(leaf_range.into_iter().chain(f.active_range)),
+        nonfinite: f.nonfinite_count + summaries.iter().map(|s| s.nonfinite).sum::<u64>(),
+    };
+    // A file may list its root entries in any order, and cells are numbered within one entry.
+    let mut frame = FlatFrame { roots, cells, bricks, stats };
+    frame.sort();
+    Flattened { frame, background }
+}
+
+struct Flattener {
+    background: f32,
+    nonfinite: NonFinite,
+    nonfinite_count: u64,
+    active_range: Option<ValueRange>,
+}
+
+impl Flattener {
+    fn value<T: Scalar>(&mut self, value: T) -> f32 {
+        let value = value.to_f32();
+        self.nonfinite_count += u64::from(!value.is_finite());
+        finite(value, self.nonfinite)
+    }
+
+    /// A tile as a constant region, unless it is inactive background.
+    fn tile<T: Scalar>(&mut self, value: T, active: bool) -> Option<Constant> {
+        let value = self.value(value);
+        if active {
+            self.active_range =
+                ValueRange::union_all(self.active_range.into_iter().chain([ValueRange::of(value)]));
+        }
+        (active || value.to_bits() != self.background.to_bits()).then_some(Constant { value, active })
+    }
+
+    /// The children of an L2 node by their place; leaves that are bricks are numbered as they come.
+    fn children<T: Scalar>(
+        &mut self,
+        node: &crate::vdb::Internal<T>,
+        summaries: &[LeafSummary],
+        brick_leaves: &mut Vec<usize>,
+    ) -> Vec<(u16, Child)> {
+        let mut leaf = node.first_child;
+        let mut children = Vec::new();
+        for i in 0..node.tiles.len() {
+            let child = if node.is_child(i) {
+                leaf += 1;
+                match summaries[leaf - 1].kind {
+                    LeafKind::Background => None,
+                    LeafKind::Constant(constant) => Some(Child::Constant(constant)),
+                    LeafKind::Brick => {
+                        brick_leaves.push(leaf - 1);
+                        Some(Child::Brick(brick_leaves.len() as u32 - 1))
+                    }
+                }
+            } else {
+                self.tile(node.tiles[i], node.is_active(i)).map(Child::Constant)
+            };
+            children.extend(child.map(|child| (i as u16, child)));
+        }
+        children
+    }
+}
+
+fn finite(value: f32, nonfinite: NonFinite) -> f32 {
+    if value.is_finite() || nonfinite == NonFinite::Refuse { value } else { 0.0 }
+}
+
+fn brick<T: Scalar>(tree: &Tree<T>, leaf: usize, nonfinite: NonFinite) -> Brick {
+    let source = tree.leaves.values(leaf);
+    let values = std::array::from_fn(|i| finite(source[i].to_f32(), nonfinite));
+    Brick { values, mask: Some(tree.leaves.masks[leaf]) }
+}
+
+fn summarise<T: Scalar>(brick: &Brick, tree: &Tree<T>, leaf: usize, background: f32) -> LeafSummary {
+    let nonfinite = tree.leaves.values(leaf).iter().filter(|v| !v.to_f32().is_finite()).count() as u64;
+    let active = tree.leaves.masks[leaf];
+    let kind = match brick.constant() {
+        Some(c) if !c.active && c.value.to_bits() == background.to_bits() => LeafKind::Background,
+        Some(constant) => LeafKind::Constant(constant),
+        None => LeafKind::Brick,
+    };
+    let active_range = brick.range_over(&active).map(|(min, max)| ValueRange { min, max });
+    LeafSummary { kind, active_range, nonfinite }
+}
+
+impl FlatFrame {
+    /// Orders cells by their origin and renumbers the bricks in the order of their cells.
+    fn sort(&mut self) {
+        self.roots.sort_by_key(|(origin, _)| *origin);
+        if self.cells.is_sorted_by_key(|c| c.origin) {
+            return;
+        }
+        self.cells.sort_by_key(|c| c.origin);
+        let mut moved: Vec<Option<Brick>> = std::mem::take(&mut self.bricks).into_iter().map(Some).collect();
+        for cell in &mut self.cells {
+            let CellContent::Node(children) = &mut cell.content else { continue };
+            for (_, child) in children {
+                if let Child::Brick(brick) = child {
+                    let taken = moved[*brick as usize].take().expect("each brick is named once");
+                    *brick = self.bricks.len() as u32;
+                    self.bricks.push(taken);
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,21 @@
+//! The eight stages, one file each. A stage knows only its neighbours' types:
+//!
+//! | | stage | gives |
+//! |---|---|---|
+//! | 1 | [`metadata`] | [`metadata::SequenceInfo`]: every file's header and grids |
+//! | 2 | [`select`] | [`select::Selection`]: the grids to pack, and their frames |
+//! | 3 | [`flatten`] | [`crate::volume::FlatFrame`]: cells and bricks of one frame |
+//! | 4 | [`dedup`] | [`dedup::SequenceTree`]: nodes and bricks shared across the sequence |
+//! | 5 | [`allocate`] | [`allocate::Allocation`]: which codec each brick gets, and its range |
+//! | 6 | [`relayout`] | [`relayout::Atlas`]: where each brick lies in the pages of a texture |
+//! | 7 | [`quantise`] | encoded slabs of the atlas |
+//! | 8 | [`serialise`] | the `.volpack` file |
+
+pub mod allocate;
+pub mod dedup;
+pub mod flatten;
+pub mod metadata;
+pub mod quantise;
+pub mod relayout;
+pub mod select;
+pub mod serialise;

@@ -1,0 +1,134 @@
+//! Stage 7: texels to the bytes of a codec, slab by slab.
+
+use std::io;
+use std::ops::Range;
+
+use rayon::prelude::*;
+
+use super::allocate::Allocation;
+use super::dedup::{Payload, SequenceTree, carried};
+use super::relayout;
+use crate::codec::{OutOfRange, Texels, encode};
+use crate::pack::Atlas;
+use crate::volume::{Brick, InactiveRule};
+
+/// Bricks that are in memory at once: 16 MB of voxels, enough slabs for every core.
+const BRICKS_IN_FLIGHT: u32 = 8192;
+
+/// One grid's bricks and where they begin in the atlas.
+pub struct GridBricks<'a> {
+    /// The grid.
+    pub tree: &'a mut SequenceTree,
+    /// Its codecs and ranges.
+    pub allocation: &'a Allocation,
+    /// The slot of the first brick of its pool; the others follow.
+    pub first_slot: u32,
+}
+
+/// The slabs cannot be encoded.
+#[derive(Debug, thiserror::Error)]
+pub enum QuantiseError {
+    /// Reading bricks back or writing slabs failed.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    /// A value that the codec cannot hold, in the grid at this place.
+    #[error("{source}")]
+    OutOfRange {
+        /// Which of the grids.
+        grid: usize,
+        /// The value.
+        source: OutOfRange,
+    },
+}
+
+/// The bricks of one slab that come from one grid.
+struct Part {
+    grid: usize,
+    first: u32,
+    bricks: Vec<Brick>,
+}
+
+/// Encodes every slab of `atlas` in order. `finish` is applied to a slab's bytes on the thread that made
+/// them, `sink` to the results in order. Returns the packing axis of each brick by grid.
+///
+/// # Errors
+/// [`QuantiseError`].
+pub fn quantise<T: Send>(
+    atlas: &Atlas,
+    grids: &mut [GridBricks],
+    finish: impl Fn(Vec<u8>) -> io::Result<T> + Sync,
+    mut sink: impl FnMut(T) -> io::Result<()>,
+) -> Result<Vec<Vec<u8>>, QuantiseError> {
+    let rules: Vec<Vec<InactiveRule>> = grids.iter().map(|g| brick_rules(g.tree)).collect();
+    let mut axes: Vec<Vec<u8>> = vec![Vec::new(); grids.len()];
+    let group = (BRICKS_IN_FLIGHT / atlas.slab_bricks()).max(1);
+    for first in (0..atlas.slabs).step_by(group as usize) {
+        let slabs = first..(first + group).min(atlas.slabs);
+        let parts = slabs.map(|slab| read_parts(grids, atlas.slots(slab))).collect::<io::Result<Vec<_>>>()?;
+        let grids = &*grids;
+        let encoded: Vec<_> = parts
+            .into_par_iter()
+            .map(|parts| {
+                let (bytes, axes) = encode_slab(atlas, grids, &rules, parts)?;
+                Ok((finish(relayout::assemble(atlas, &bytes))?, axes))
+            })
+            .collect::<Result<_, QuantiseError>>()?;
+        for (slab, slab_axes) in encoded {
+            sink(slab)?;
+            for (grid, part) in slab_axes {
+                axes[grid].extend(part);
+            }
+        }
+    }
+    Ok(axes)
+}
+
+/// The inactive rule of each brick of the pool.
+fn brick_rules(tree: &SequenceTree) -> Vec<InactiveRule> {
+    // Records of bricks are made in the order of the pool.
+    let of_brick = tree.records.iter().filter(|r| matches!(r.payload, Payload::Brick(_)));
+    of_brick.map(|r| r.rule).collect()
+}
+
+fn read_parts(grids: &mut [GridBricks], slots: Range<u32>) -> io::Result<Vec<Part>> {
+    let mut parts = Vec::new();
+    for (grid, source) in grids.iter_mut().enumerate() {
+        let start = slots.start.max(source.first_slot) - source.first_slot;
+        let end = slots.end.saturating_sub(source.first_slot).min(source.tree.pool.len());
+        if start < end {
+            let mut bricks = Vec::new();
+            source.tree.pool.read(start..end, &mut bricks)?;
+            parts.push(Part { grid, first: start, bricks });
+        }
+    }
+    Ok(parts)
+}
+
+type PartAxes = Vec<(usize, Vec<u8>)>;
+
+fn encode_slab(
+    atlas: &Atlas,
+    grids: &[GridBricks],
+    rules: &[Vec<InactiveRule>],
+    parts: Vec<Part>,
+) -> Result<(Vec<u8>, PartAxes), QuantiseError> {
+    let mut bytes = Vec::with_capacity(atlas.slab_bytes());
+    let mut axes = Vec::new();
+    for Part { grid, first, bricks } in parts {
+        let source = &grids[grid];
+        let texels: Vec<Texels> = bricks
+            .iter()
+            .zip(first as usize..)
+            .map(|(brick, id)| {
+                let carried = carried(brick, rules[grid][id]);
+                let range = source.tree.brick_ranges[id];
+                Texels::new(brick, carried, (range.min, range.max), source.allocation.ranges[id])
+            })
+            .collect();
+        let encoded = encode(atlas.codec, &source.allocation.sequence, &texels)
+            .map_err(|source| QuantiseError::OutOfRange { grid, source })?;
+        bytes.extend(encoded.bytes);
+        axes.push((grid, encoded.axes));
+    }
+    Ok((bytes, axes))
+}

@@ -1,0 +1,493 @@
+//! Stage 8: everything into one `.volpack`.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::io;
+use std::path::Path;
+
+use super::allocate::Allocation;
+use super::dedup::{CellRef, Payload, SequenceTree};
+use super::quantise::{GridBricks, QuantiseError, quantise};
+use super::relayout;
+use crate::codec::Codec;
+use crate::pack::layout::{AtlasRecord, CHUNK_BYTES, FrameRecord, GridRecord, encoding, kind};
+use crate::pack::tree::{
+    self, GRID_WORDS, HEADER_WORDS, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS,
+};
+use crate::pack::{Atlas, PackWriter, Provenance, SectionSpec, compress_chunk};
+use crate::vdb::GridClass;
+use crate::volume::{CELL_DIM, Constant, Coord, Interner, ROOT_DIM};
+
+/// L1 nodes a frame may have room for: 4 MB of links. A box of 100 of them an axis is 400,000 voxels
+/// wide; only stray voxels far from the rest need more.
+const MAX_ROOTS: i64 = 1 << 20;
+
+/// One grid, ready to be written.
+pub struct GridInput {
+    /// Its name.
+    pub name: String,
+    /// What kind of field it holds.
+    pub class: GridClass,
+    /// Frames per second; 0 when not stated.
+    pub fps: f32,
+    /// Its frames, in the order of `tree`.
+    pub frames: Vec<FrameInput>,
+    /// Its nodes and bricks.
+    pub tree: SequenceTree,
+    /// Its codecs and ranges.
+    pub allocation: Allocation,
+}
+
+/// What the frame table says of a frame beside what its tree says.
+#[derive(Clone, Debug)]
+pub struct FrameInput {
+    /// Its number.
+    pub number: i32,
+    /// Its source's place in the provenance.
+    pub source: u32,
+    /// Index space to world space.
+    pub transform: [f64; 16],
+}
+
+/// The pack cannot be written.
+#[derive(Debug, thiserror::Error)]
+pub enum SerialiseError {
+    /// Writing failed.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    /// A value does not fit the codec.
+    #[error(transparent)]
+    Quantise(#[from] QuantiseError),
+    /// Something is larger than the format can address.
+    #[error("grid {grid:?}: {what}")]
+    TooLarge {
+        /// The grid.
+        grid: String,
+        /// What, and what to do.
+        what: String,
+    },
+}
+
+/// Writes the pack and returns its length. All grids use the codec of the first.
+///
+/// # Errors
+/// [`SerialiseError`]. Nothing is left at `path` that was not there before.
+///
+/// # Panics
+/// When there is no grid.
+pub fn serialise(
+    path: &Path,
+    grids: &mut [GridInput],
+    provenance: &Provenance,
+    zstd_level: Option<i32>,
+    mut progress: impl FnMut(u64),
+) -> Result<u64, SerialiseError> {
+    let codec = grids[0].allocation.codec;
+    let bricks: u64 = grids.iter().map(|g| u64::from(g.tree.pool.len())).sum();
+    if bricks >= L3Record::MAX_SLOTS.into() {
+        return Err(too_large(
+            &grids[0].name,
+            format!("{bricks} distinct bricks, a pack holds 2^27: use fewer frames"),
+        ));
+    }
+    let atlas = relayout::plan(codec, bricks as u32);
+    let boxes = grids.iter().map(CellBox::around).collect::<Result<Vec<_>, _>>()?;
+    let first_slots: Vec<u32> =
+        grids.iter().scan(0, |next, g| Some(std::mem::replace(next, *next + g.tree.pool.len()))).collect();
+    let mut words = TreeWords::build(grids, &boxes, &atlas, &first_slots);
+
+    let plain = if zstd_level.is_some() { encoding::ZSTD } else { encoding::RAW };
+    let texel_encoding = match (codec, zstd_level) {
+        (_, None) => encoding::RAW,
+        (Codec::F16, _) => encoding::ZSTD_SHUFFLE_2,
+        (Codec::F32, _) => encoding::ZSTD_SHUFFLE_4,
+        _ => encoding::ZSTD,
+    };
+    let level = zstd_level.unwrap_or(0);
+
+    let names: String = grids.iter().map(|g| g.name.as_str()).collect();
+    let slabs: Vec<Vec<Vec<u32>>> =
+        grids.iter().zip(&first_slots).map(|(g, &s)| frame_slabs(g, &atlas, s)).collect();
+    let list_len: usize = slabs.iter().flatten().map(Vec::len).sum();
+    let frame_count: usize = grids.iter().map(|g| g.frames.len()).sum();
+    let provenance = serde_json::to_vec_pretty(provenance).map_err(io::Error::from)?;
+
+    let spec = |kind, encoding, raw_bytes: usize| SectionSpec {
+        kind,
+        codec: 0,
+        encoding,
+        chunk_bytes: CHUNK_BYTES,
+        raw_bytes: raw_bytes as u64,
+    };
+    let mut specs = vec![
+        spec(kind::GRIDS, encoding::RAW, grids.len() * size_of::<GridRecord>()),
+        spec(kind::FRAMES, plain, frame_count * size_of::<FrameRecord>()),
+        spec(kind::NAMES, encoding::RAW, names.len()),
+        spec(kind::ATLASES, encoding::RAW, if atlas.bricks > 0 { size_of::<AtlasRecord>() } else { 0 }),
+        spec(kind::FRAME_CHUNKS, plain, list_len * 4),
+        spec(kind::PROVENANCE, plain, provenance.len()),
+    ];
+    let chunks_before: u64 = specs.iter().map(|s| s.raw_bytes.div_ceil(s.chunk_bytes.into())).sum();
+    if atlas.bricks > 0 {
+        specs.push(SectionSpec {
+            kind: kind::TEXELS,
+            codec: codec as u32,
+            encoding: texel_encoding,
+            chunk_bytes: atlas.slab_bytes() as u32,
+            raw_bytes: atlas.bytes(),
+        });
+    }
+    // The tree comes last: its records hold the packing axes, which encoding chooses.
+    specs.push(spec(kind::TREE, plain, words.words.len() * 4));
+
+    let (frames, lists) = frame_tables(grids, &slabs, chunks_before as u32);
+    let mut writer = PackWriter::create(path, specs)?;
+    writer.section(bytemuck::cast_slice(&grid_records(grids)), level)?;
+    writer.section(bytemuck::cast_slice(&frames), level)?;
+    writer.section(names.as_bytes(), level)?;
+    if atlas.bricks > 0 {
+        writer.section(bytemuck::bytes_of(&atlas_record(&atlas)), level)?;
+    } else {
+        writer.section(&[], level)?;
+    }
+    writer.section(bytemuck::cast_slice(&lists), level)?;
+    writer.section(&provenance, level)?;
+
+    if atlas.bricks > 0 {
+        writer.begin()?;
+        let mut sources: Vec<GridBricks> = grids
+            .iter_mut()
+            .zip(&first_slots)
+            .map(|(g, &first_slot)| GridBricks { tree: &mut g.tree, allocation: &g.allocation, first_slot })
+            .collect();
+        let axes = quantise(
+            &atlas,
+            &mut sources,
+            |slab| compress_chunk(slab, texel_encoding, level),
+            |chunk| {
+                progress(atlas.slab_bricks().into());
+                writer.chunk(&chunk)
+            },
+        )?;
+        words.set_axes(grids, &axes);
+    }
+    writer.section(bytemuck::cast_slice(&words.words), level)?;
+    Ok(writer.finish()?)
+}
+
+fn too_large(grid: &str, what: String) -> SerialiseError {
+    SerialiseError::TooLarge { grid: grid.to_owned(), what }
+}
+
+fn atlas_record(atlas: &Atlas) -> AtlasRecord {
+    let Atlas { codec, bricks, columns, rows, slabs, page_slabs } = *atlas;
+    AtlasRecord { codec: codec as u32, bricks, columns, rows, slabs, page_slabs }
+}
+
+fn grid_records(grids: &[GridInput]) -> Vec<GridRecord> {
+    let (mut name_offset, mut first_frame) = (0, 0);
+    grids
+        .iter()
+        .map(|g| {
+            let active = g.tree.active_range();
+            let record = GridRecord {
+                name_offset,
+                name_bytes: g.name.len() as u32,
+                class: g.class as u32,
+                first_frame,
+                frames: g.frames.len() as u32,
+                fps: g.fps,
+                active_min: active.map_or(0.0, |r| r.min),
+                active_max: active.map_or(0.0, |r| r.max),
+            };
+            name_offset += record.name_bytes;
+            first_frame += record.frames;
+            record
+        })
+        .collect()
+}
+
+/// The slabs that each frame's bricks lie in, ascending.
+fn frame_slabs(grid: &GridInput, atlas: &Atlas, first_slot: u32) -> Vec<Vec<u32>> {
+    let tree = &grid.tree;
+    let frame = |frame: &super::dedup::FrameTree| {
+        let nodes = frame.cells.iter().filter_map(|(_, content)| match content {
+            CellRef::Node(node) => Some(&tree.nodes.items()[*node as usize]),
+            CellRef::Constant(_) => None,
+        });
+        let records = nodes.flat_map(|node| node.entries(&tree.runs)).map(|&r| &tree.records[r as usize]);
+        let slabs = records.filter_map(|record| match record.payload {
+            Payload::Brick(id) => Some((first_slot + id) / atlas.slab_bricks()),
+            Payload::Constant(_) => None,
+        });
+        slabs.collect::<BTreeSet<u32>>().into_iter().collect()
+    };
+    tree.frames.iter().map(frame).collect()
+}
+
+fn frame_tables(
+    grids: &[GridInput],
+    slabs: &[Vec<Vec<u32>>],
+    first_chunk: u32,
+) -> (Vec<FrameRecord>, Vec<u32>) {
+    let mut records = Vec::new();
+    let mut lists: Vec<u32> = Vec::new();
+    for (g, (grid, slabs)) in grids.iter().zip(slabs).enumerate() {
+        for ((input, frame), slabs) in grid.frames.iter().zip(&grid.tree.frames).zip(slabs) {
+            records.push(FrameRecord {
+                grid: g as u32,
+                number: input.number,
+                source: input.source,
+                first_chunk: lists.len() as u32,
+                chunks: slabs.len() as u32,
+                bbox: frame.stats.bbox.to_array(),
+                reserved: 0,
+                leaves: frame.stats.leaves,
+                active_voxels: frame.stats.active_voxels,
+                transform: input.transform,
+            });
+            lists.extend(slabs.iter().map(|slab| first_chunk + slab));
+        }
+    }
+    (records, lists)
+}
+
+/// The part of index space that a grid's L1 nodes cover.
+struct CellBox {
+    origin: Coord,
+    /// 128³ cells of one L1 node an axis.
+    cells: [u32; 3],
+    /// L1 nodes an axis.
+    roots: [u32; 3],
+}
+
+impl CellBox {
+    fn around(grid: &GridInput) -> Result<Self, SerialiseError> {
+        let mut min = [i64::MAX; 3];
+        let mut max = [i64::MIN; 3];
+        let frames = || grid.tree.frames.iter();
+        let cells = frames().flat_map(|f| f.cells.iter().map(|(at, _)| (at, CELL_DIM)));
+        let roots = frames().flat_map(|f| f.roots.iter().map(|(at, _)| (at, ROOT_DIM)));
+        for (at, dim) in cells.chain(roots) {
+            for a in 0..3 {
+                min[a] = min[a].min(at.0[a].into());
+                max[a] = max[a].max(i64::from(at.0[a]) + i64::from(dim));
+            }
+        }
+        if min[0] > max[0] {
+            return Ok(Self { origin: Coord::default(), cells: [1; 3], roots: [1; 3] });
+        }
+        let (cell, root) = (i64::from(CELL_DIM), i64::from(ROOT_DIM));
+        let one_node = (0..3).all(|a| max[a] - min[a] <= root);
+        if !one_node {
+            // Several L1 nodes lie where OpenVDB's root entries do, so that a constant root entry is
+            // one link.
+            min = min.map(|v| v.div_euclid(root) * root);
+            max = max.map(|v| (v + root - 1).div_euclid(root) * root);
+        }
+        let extent: [i64; 3] = std::array::from_fn(|a| max[a] - min[a]);
+        let roots = if one_node { [1; 3] } else { extent.map(|e| e / root) };
+        if roots.iter().try_fold(1i64, |n, r| n.checked_mul(*r)).is_none_or(|n| n > MAX_ROOTS) {
+            return Err(too_large(
+                &grid.name,
+                format!(
+                    "its voxels lie in a box of {} × {} × {} voxels, too sparse to address: \
+                     delete stray voxels far from the rest, or pack its parts apart",
+                    extent[0], extent[1], extent[2]
+                ),
+            ));
+        }
+        Ok(Self {
+            origin: Coord(min.map(|v| v as i32)),
+            cells: if one_node { extent.map(|e| (e / cell) as u32) } else { [32; 3] },
+            roots: roots.map(|r| r as u32),
+        })
+    }
+
+    /// Which L1 node holds a voxel, and which of its cells.
+    fn index(&self, at: Coord) -> (usize, usize) {
+        let cell: [u32; 3] = std::array::from_fn(|a| {
+            ((i64::from(at.0[a]) - i64::from(self.origin.0[a])) / i64::from(CELL_DIM)) as u32
+        });
+        let flat = |v: [u32; 3], dims: [u32; 3]| ((v[0] * dims[1] + v[1]) * dims[2] + v[2]) as usize;
+        let root = std::array::from_fn(|a| cell[a] / self.cells[a]);
+        let inside = std::array::from_fn(|a| cell[a] % self.cells[a]);
+        (flat(root, self.roots), flat(inside, self.cells))
+    }
+
+    fn cell_count(&self) -> usize {
+        self.cells.iter().product::<u32>() as usize
+    }
+
+    fn root_count(&self) -> usize {
+        self.roots.iter().product::<u32>() as usize
+    }
+}
+
+/// The tree section's words, and where its records are.
+struct TreeWords {
+    words: Vec<u32>,
+    record_at: usize,
+}
+
+impl TreeWords {
+    fn build(grids: &[GridInput], boxes: &[CellBox], atlas: &Atlas, first_slots: &[u32]) -> Self {
+        let mut constants = Interner::<u32>::default();
+        let grids_at = HEADER_WORDS;
+        let roots_at = grids_at + grids.len() * GRID_WORDS;
+        let root_words: usize = grids.iter().zip(boxes).map(|(g, b)| g.frames.len() * b.root_count()).sum();
+        let l1_at = roots_at + root_words;
+
+        let mut l1 = Interner::<u32>::default();
+        let mut headers = Vec::new();
+        let mut roots = Vec::new();
+        let mut nodes = 0u32;
+        for (grid, bounds) in grids.iter().zip(boxes) {
+            headers.extend(grid_header(grid, bounds, roots_at + roots.len()));
+            for frame in &grid.tree.frames {
+                roots.extend(frame_roots(frame, bounds, l1_at, nodes, &mut l1, &mut constants));
+            }
+            nodes += grid.tree.nodes.items().len() as u32;
+        }
+
+        let node_at = l1_at + l1.items().len();
+        let record_at = node_at + nodes as usize * NODE_WORDS;
+        let records: usize = grids.iter().map(|g| run_len(&g.tree)).sum();
+        let mask_at = record_at + records * RECORD_WORDS;
+        let masks: usize = grids.iter().map(|g| g.tree.masks.items().len()).sum();
+        let constant_at = mask_at + masks * MASK_WORDS;
+        let total = constant_at + constants.items().len();
+
+        let mut words = vec![0; HEADER_WORDS];
+        {
+            use tree::header as h;
+            for (place, value) in [
+                (h::WORDS, total),
+                (h::GRIDS, grids.len()),
+                (h::GRID_AT, grids_at),
+                (h::NODE_AT, node_at),
+                (h::NODES, nodes as usize),
+                (h::RECORD_AT, record_at),
+                (h::RECORDS, records),
+                (h::MASK_AT, mask_at),
+                (h::MASKS, masks),
+                (h::CONSTANT_AT, constant_at),
+                (h::CONSTANTS, constants.items().len()),
+            ] {
+                words[place] = value as u32;
+            }
+            if atlas.bricks > 0 {
+                let at = h::atlas(atlas.codec);
+                words[at..at + 3].copy_from_slice(&[atlas.columns, atlas.rows, atlas.page_slabs]);
+            }
+        }
+        words.extend(headers);
+        words.extend(roots);
+        words.extend(l1.items());
+
+        let mut first_record = 0u32;
+        for grid in grids {
+            for node in grid.tree.nodes.items() {
+                let mask: Vec<u32> =
+                    node.children.iter().flat_map(|w| [*w as u32, (w >> 32) as u32]).collect();
+                words.extend(&mask);
+                words.extend(tree::ranks(&mask));
+                words.push(first_record + node.run as u32);
+            }
+            first_record += run_len(&grid.tree) as u32;
+        }
+        let mut first_mask = 0;
+        for (grid, &first_slot) in grids.iter().zip(first_slots) {
+            for &record in grid.tree.runs.items() {
+                words.extend(l3_record(grid, record, first_slot, first_mask).to_words());
+            }
+            first_mask += grid.tree.masks.items().len() as u32;
+        }
+        for grid in grids {
+            words.extend(grid.tree.masks.items().iter().flat_map(|m| m.to_words()));
+        }
+        words.extend(constants.items());
+        debug_assert_eq!(words.len(), total);
+        Self { words, record_at }
+    }
+
+    /// Fills in the packing axes, by grid and brick.
+    fn set_axes(&mut self, grids: &[GridInput], axes: &[Vec<u8>]) {
+        let mut at = self.record_at;
+        for (grid, axes) in grids.iter().zip(axes) {
+            for &record in grid.tree.runs.items() {
+                if let Payload::Brick(id) = grid.tree.records[record as usize].payload {
+                    self.words[at] |= u32::from(axes[id as usize]) << 3;
+                }
+                at += RECORD_WORDS;
+            }
+        }
+    }
+}
+
+fn run_len(tree: &SequenceTree) -> usize {
+    tree.runs.items().len()
+}
+
+fn grid_header(grid: &GridInput, bounds: &CellBox, root_at: usize) -> [u32; GRID_WORDS] {
+    use tree::grid as g;
+    let mut words = [0; GRID_WORDS];
+    words[g::ORIGIN..g::ORIGIN + 3].copy_from_slice(&bounds.origin.0.map(|v| v as u32));
+    words[g::CELLS..g::CELLS + 3].copy_from_slice(&bounds.cells);
+    words[g::ROOTS..g::ROOTS + 3].copy_from_slice(&bounds.roots);
+    words[g::LO] = grid.allocation.sequence.lo.to_bits();
+    words[g::SPAN] = grid.allocation.sequence.span.to_bits();
+    words[g::BACKGROUND] = grid.tree.background.to_bits();
+    words[g::ROOT_AT] = root_at as u32;
+    words[g::FRAMES] = grid.frames.len() as u32;
+    words
+}
+
+/// The links of one frame's roots; its L1 nodes go into `l1`, whose first word is word `l1_at`.
+fn frame_roots(
+    frame: &super::dedup::FrameTree,
+    bounds: &CellBox,
+    l1_at: usize,
+    first_node: u32,
+    l1: &mut Interner<u32>,
+    constants: &mut Interner<u32>,
+) -> Vec<u32> {
+    let mut link = |c: Constant| {
+        let index = constants.intern(&[c.value.to_bits()]);
+        Link::Constant { index, active: c.active }.to_word()
+    };
+    let mut roots = vec![0; bounds.root_count()];
+    for &(at, constant) in &frame.roots {
+        roots[bounds.index(at).0] = link(constant);
+    }
+    let mut cells: BTreeMap<usize, Vec<(usize, u32)>> = BTreeMap::new();
+    for &(at, content) in &frame.cells {
+        let (root, cell) = bounds.index(at);
+        let word = match content {
+            CellRef::Constant(constant) => link(constant),
+            CellRef::Node(node) => Link::Node(first_node + node).to_word(),
+        };
+        cells.entry(root).or_default().push((cell, word));
+    }
+    for (root, cells) in cells {
+        let (mask_words, _) = tree::l1_words(bounds.cell_count());
+        let mut words = vec![0; mask_words];
+        for &(cell, _) in &cells {
+            words[cell / 32] |= 1 << (cell % 32);
+        }
+        words.extend(tree::ranks(&words));
+        words.extend(cells.iter().map(|(_, word)| word));
+        roots[root] = Link::Node(l1_at as u32 + l1.intern(&words)).to_word();
+    }
+    roots
+}
+
+fn l3_record(grid: &GridInput, record: u32, first_slot: u32, first_mask: u32) -> L3Record {
+    let record = &grid.tree.records[record as usize];
+    let (codec, slot, word2) = match record.payload {
+        Payload::Constant(value) => (Codec::Constant, 0, value.to_bits()),
+        Payload::Brick(id) => {
+            (grid.allocation.codec, first_slot + id, grid.allocation.ranges[id as usize].to_word())
+        }
+    };
+    L3Record { codec, axis: 0, slot, mask: record.mask.map(|m| first_mask + m), rule: record.rule, word2 }
+}

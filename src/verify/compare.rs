@@ -1,0 +1,296 @@
+//! One frame of a pack against the tree of its source.
+
+use rayon::prelude::*;
+
+use crate::codec::{BrickRange, Codec};
+use crate::pack::{FrameReader, Region};
+use crate::settings::NonFinite;
+use crate::vdb::{GridClass, GridInfo, Internal, Scalar, Tree};
+use crate::volume::{
+    BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, InactiveRule, Mask512, ROOT_DIM, ValueRange,
+};
+
+/// A level set's sign may flip where the surface is nearer than this many voxels: there the sign is
+/// within what any quantisation of the distance moves the surface by.
+const SIGN_MATTERS_VOXELS: f64 = 0.1;
+
+/// Squared errors of some voxels.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Error {
+    pub voxels: u64,
+    pub squares: f64,
+    pub max: f64,
+    pub sign_flips: u64,
+}
+
+impl Error {
+    pub fn add(&mut self, other: &Self) {
+        self.voxels += other.voxels;
+        self.squares += other.squares;
+        self.max = self.max.max(other.max);
+        self.sign_flips += other.sign_flips;
+    }
+
+    fn voxel(&mut self, error: f64, flipped: bool) {
+        self.voxels += 1;
+        self.squares += error * error;
+        self.max = self.max.max(error.abs());
+        self.sign_flips += u64::from(flipped);
+    }
+}
+
+/// What differs in one frame.
+#[derive(Clone, Debug, Default)]
+pub(super) struct FrameError {
+    /// Over active leaf voxels.
+    pub active: Error,
+    /// Over all leaf voxels.
+    pub all: Error,
+    /// The range of the source's active values, tiles included.
+    pub active_range: Option<ValueRange>,
+    failures: u64,
+    first_failure: Option<String>,
+}
+
+impl FrameError {
+    fn fail(&mut self, what: impl FnOnce() -> String) {
+        self.failures += 1;
+        self.first_failure.get_or_insert_with(what);
+    }
+
+    fn add(&mut self, other: Self) {
+        self.active.add(&other.active);
+        self.all.add(&other.all);
+        self.active_range = ValueRange::union_all(self.active_range.into_iter().chain(other.active_range));
+        self.failures += other.failures;
+        self.first_failure = self.first_failure.take().or(other.first_failure);
+    }
+
+    fn active_value(&mut self, value: f32) {
+        let value = ValueRange::of(value);
+        self.active_range = Some(self.active_range.map_or(value, |range| range.union(value)));
+    }
+
+    /// The first thing that failed, and how many more did.
+    pub fn failure(&self) -> Option<String> {
+        let more = self.failures.saturating_sub(1);
+        self.first_failure
+            .as_ref()
+            .map(|f| if more > 0 { format!("{f} (and {more} more)") } else { f.clone() })
+    }
+}
+
+struct Comparison<'a, T> {
+    tree: &'a Tree<T>,
+    reader: &'a FrameReader<'a>,
+    nonfinite: NonFinite,
+    /// The distance above which a level set's sign counts; `None` for other grids.
+    sign_matters: Option<f64>,
+}
+
+pub(super) fn compare<T: Scalar>(
+    tree: &Tree<T>,
+    info: &GridInfo,
+    reader: &FrameReader,
+    nonfinite: NonFinite,
+) -> FrameError {
+    let voxel_size = info.transform.voxel_size().map_or(1.0, |s| s.into_iter().fold(f64::INFINITY, f64::min));
+    let is_level_set = reader.grid().record.class == GridClass::LevelSet as u32;
+    let c = Comparison {
+        tree,
+        reader,
+        nonfinite,
+        sign_matters: is_level_set.then_some(SIGN_MATTERS_VOXELS * voxel_size),
+    };
+    let mut error = FrameError::default();
+    c.check_header(info, &mut error);
+    c.check_tiles(&mut error);
+    c.check_outside(&mut error);
+    // Summed leaf by leaf in a fixed order, so that figures do not depend on threads.
+    let leaves: Vec<FrameError> = (0..tree.leaves.len()).into_par_iter().map(|leaf| c.leaf(leaf)).collect();
+    leaves.into_iter().for_each(|leaf| error.add(leaf));
+    error
+}
+
+impl<T: Scalar> Comparison<'_, T> {
+    /// The source's value as the pack should have it.
+    fn value(&self, value: T) -> f32 {
+        let value = value.to_f32();
+        if value.is_finite() || self.nonfinite == NonFinite::Refuse { value } else { 0.0 }
+    }
+
+    fn check_header(&self, info: &GridInfo, error: &mut FrameError) {
+        let frame = &self.reader.frame().record;
+        let stats = self.tree.topology_stats();
+        if frame.bbox != stats.bbox.to_array()
+            || frame.leaves != stats.leaves
+            || frame.active_voxels != stats.active_voxels
+        {
+            error.fail(|| "the frame table's box or counts are not the source's".to_owned());
+        }
+        if Some(frame.transform) != info.transform.matrix {
+            error.fail(|| "the transform is not the source's".to_owned());
+        }
+        let (ours, theirs) = (self.reader.grid().background, self.value(self.tree.background));
+        let empty = stats.leaves == 0 && self.tree.l1.is_empty() && self.tree.tiles.is_empty();
+        if ours.to_bits() != theirs.to_bits() && !empty {
+            error.fail(|| format!("the background is {ours}, the source's is {theirs}"));
+        }
+    }
+
+    /// Every tile of the source, active or not, must be there exactly.
+    fn check_tiles(&self, error: &mut FrameError) {
+        for tile in &self.tree.tiles {
+            self.check_tile(tile.origin, ROOT_DIM, tile.value, tile.active, error);
+        }
+        let levels: [(&[Internal<T>], u32, i32); 2] =
+            [(&self.tree.l1, 5, CELL_DIM), (&self.tree.l2, 4, BRICK_DIM)];
+        for (nodes, log2, dim) in levels {
+            for node in nodes {
+                for i in node.tile_indices() {
+                    let origin = node.origin.offset_by(Coord::child_offset(i, log2, dim));
+                    self.check_tile(origin, dim, node.tiles[i], node.is_active(i), error);
+                }
+            }
+        }
+    }
+
+    fn check_tile(&self, origin: Coord, dim: i32, value: T, active: bool, error: &mut FrameError) {
+        let value = self.value(value);
+        if active {
+            error.active_value(value);
+        }
+        let expected = Constant { value, active };
+        let (region, region_dim) = self.reader.locate(origin);
+        let same = match region {
+            Region::Background => {
+                let background = self.reader.grid().background;
+                region_dim >= dim && !active && value.to_bits() == background.to_bits()
+            }
+            Region::Constant(constant) => region_dim >= dim && constant.key() == expected.key(),
+            Region::Brick(record) => {
+                region_dim >= dim
+                    && self.reader.decode(&record).is_ok_and(|brick| {
+                        let state = if active { Mask512::ALL } else { Mask512::NONE };
+                        brick.active == state && brick.values.iter().all(|v| v.to_bits() == value.to_bits())
+                    })
+            }
+        };
+        if !same {
+            error.fail(|| format!("the {dim}³ tile at {:?} is not {value}", origin.0));
+        }
+    }
+
+    /// Nothing may be where the source has no root entry; inside one, every leaf and tile is asked for.
+    fn check_outside(&self, error: &mut FrameError) {
+        let mut entries: Vec<Coord> = self.tree.l1.iter().map(|n| n.origin).collect();
+        entries.extend(self.tree.tiles.iter().map(|t| t.origin));
+        entries.sort_unstable();
+        self.reader.for_each_region(|origin, _, _| {
+            if entries.binary_search(&origin.align_down(ROOT_DIM)).is_err() {
+                error.fail(|| format!("the pack has voxels at {:?}, where the source has none", origin.0));
+            }
+        });
+    }
+
+    fn leaf(&self, leaf: usize) -> FrameError {
+        let mut error = FrameError::default();
+        let origin = self.tree.leaves.origins[leaf];
+        let source = self.tree.leaves.values(leaf);
+        let mask = &self.tree.leaves.masks[leaf];
+        mask.ones().for_each(|i| error.active_value(self.value(source[i])));
+
+        let background = self.reader.grid().background;
+        let (region, _) = self.reader.locate(origin);
+        let constant = |c: Constant| {
+            (Box::new([c.value; BRICK_VOXELS]), if c.active { Mask512::ALL } else { Mask512::NONE })
+        };
+        let (values, active) = match region {
+            Region::Background => constant(Constant { value: background, active: false }),
+            Region::Constant(c) => constant(c),
+            Region::Brick(record) => match self.reader.decode(&record) {
+                Ok(brick) => (brick.values, brick.active),
+                Err(e) => {
+                    error.fail(|| format!("the brick at {:?}: {e}", origin.0));
+                    return error;
+                }
+            },
+        };
+        let contract = Contract::of(&region, self.reader);
+        if contract.keeps_mask && active != *mask {
+            error.fail(|| format!("the brick at {:?} has other active voxels", origin.0));
+        }
+        for i in 0..BRICK_VOXELS {
+            let (ours, theirs) = (values[i], self.value(source[i]));
+            let difference = f64::from(ours) - f64::from(theirs);
+            let flipped = self.sign_matters.is_some() && (ours < 0.0) != (theirs < 0.0);
+            error.all.voxel(difference, flipped);
+            if mask.get(i) {
+                error.active.voxel(difference, flipped);
+            }
+            let at = || origin.offset_by(Coord::child_offset(i, 3, 1)).0;
+            if flipped && self.sign_matters.is_some_and(|d| f64::from(theirs).abs() > d) {
+                error.fail(|| format!("the sign at {:?} flipped: {ours}, the source has {theirs}", at()));
+            } else if !contract.allows(ours, theirs, mask.get(i)) {
+                error.fail(|| format!("the value at {:?} is {ours}, the source has {theirs}", at()));
+            }
+        }
+        error
+    }
+}
+
+/// What a region's codec promises of each voxel.
+struct Contract {
+    /// Whether the active mask is kept, bit by bit.
+    keeps_mask: bool,
+    /// Whether inactive voxels come from a rule and must be exact.
+    exact_inactive: bool,
+    /// How far a voxel's value may be off.
+    values: Bound,
+}
+
+enum Bound {
+    /// Not a bit.
+    Exact,
+    /// The nearest half float.
+    Half,
+    /// This much, in the grid's units.
+    Within(f64),
+}
+
+impl Contract {
+    fn of(region: &Region, reader: &FrameReader) -> Self {
+        let Region::Brick(record) = region else {
+            return Self { keeps_mask: true, exact_inactive: true, values: Bound::Exact };
+        };
+        let span = f64::from(reader.grid().sequence.span);
+        let extent = BrickRange::from_word(record.word2).extent.to_f64() * span;
+        // Room for the arithmetic of decoding, which is in f32.
+        let slack = 1e-6 * (span + f64::from(reader.grid().sequence.lo).abs());
+        let values = match record.codec {
+            Codec::Constant | Codec::F32 => Bound::Exact,
+            Codec::F16 => Bound::Half,
+            // Half a step of 255.
+            Codec::Unorm8 => Bound::Within(extent / 510.0 + slack),
+            // Blocks promise no more than to stay inside the brick's range.
+            Codec::Bc4 | Codec::Bc7 => Bound::Within(extent + slack),
+        };
+        Self {
+            keeps_mask: record.mask.is_some(),
+            exact_inactive: record.mask.is_some() && record.rule != InactiveRule::Texel,
+            values,
+        }
+    }
+
+    fn allows(&self, ours: f32, theirs: f32, active: bool) -> bool {
+        let exact = ours.to_bits() == theirs.to_bits();
+        if !active && self.exact_inactive {
+            return exact;
+        }
+        match self.values {
+            Bound::Exact => exact,
+            Bound::Half => ours.to_bits() == half::f16::from_f32(theirs).to_f32().to_bits(),
+            Bound::Within(bound) => (f64::from(ours) - f64::from(theirs)).abs() <= bound,
+        }
+    }
+}

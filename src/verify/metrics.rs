@@ -1,0 +1,145 @@
+//! Errors as people and machines read them.
+
+use serde::Serialize;
+
+use super::compare::{Error, FrameError};
+use crate::pack::Pack;
+
+/// How far decoded values are from the source's.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct Metrics {
+    /// Voxels compared.
+    pub voxels: u64,
+    /// Root mean square error, in the grid's units.
+    pub rmse: f64,
+    /// Decibels under the peak (maximum less minimum of the sequence's active values); null where the
+    /// error is zero.
+    pub psnr: Option<f64>,
+    /// The largest error, in the grid's units.
+    pub max_error: f64,
+    /// Level sets: voxels that changed sides.
+    pub sign_flips: u64,
+}
+
+/// One frame of one grid.
+#[derive(Clone, Debug, Serialize)]
+pub struct FrameReport {
+    /// The grid.
+    pub grid: String,
+    /// The frame's number.
+    pub frame: i32,
+    /// Over active leaf voxels.
+    pub active: Metrics,
+    /// Over all leaf voxels.
+    pub all: Metrics,
+}
+
+/// The frame with the lowest PSNR.
+#[derive(Clone, Debug, Serialize)]
+pub struct WorstFrame {
+    /// Its grid.
+    pub grid: String,
+    /// Its number.
+    pub frame: i32,
+    /// Its PSNR over active leaf voxels.
+    pub psnr: f64,
+}
+
+/// One grid over all its frames.
+#[derive(Clone, Debug, Serialize)]
+pub struct GridReport {
+    /// Its name.
+    pub grid: String,
+    /// What its PSNR is measured against.
+    pub peak: f64,
+    /// Over active leaf voxels.
+    pub active: Metrics,
+    /// Over all leaf voxels.
+    pub all: Metrics,
+}
+
+/// What the voxel ring found.
+#[derive(Clone, Debug, Serialize)]
+pub struct VerifyReport {
+    /// Whether nothing failed.
+    pub ok: bool,
+    /// What failed, at most one line a frame.
+    pub failures: Vec<String>,
+    /// The grid with the lowest PSNR, over active leaf voxels.
+    pub active: Metrics,
+    /// The grid with the lowest PSNR, over all leaf voxels.
+    pub all: Metrics,
+    /// The worst frame; null where every frame is exact.
+    pub worst_frame: Option<WorstFrame>,
+    /// Each grid.
+    pub grids: Vec<GridReport>,
+    /// Each frame of each grid.
+    pub frames: Vec<FrameReport>,
+}
+
+impl Metrics {
+    fn new(error: &Error, peak: f64) -> Self {
+        let rmse = if error.voxels == 0 { 0.0 } else { (error.squares / error.voxels as f64).sqrt() };
+        Self {
+            voxels: error.voxels,
+            rmse,
+            psnr: (rmse > 0.0 && peak > 0.0).then(|| 20.0 * (peak / rmse).log10()),
+            max_error: error.max,
+            sign_flips: error.sign_flips,
+        }
+    }
+}
+
+/// The less exact of two; no PSNR is no error.
+fn worse(a: Metrics, b: Metrics) -> Metrics {
+    let psnr = |m: &Metrics| m.psnr.unwrap_or(f64::INFINITY);
+    if psnr(&b) < psnr(&a) { b } else { a }
+}
+
+impl VerifyReport {
+    /// Sums up the errors of each frame of each grid.
+    pub(super) fn new(pack: &Pack, errors: Vec<Vec<FrameError>>) -> Self {
+        let (mut grids, mut frames, mut failures) = (Vec::new(), Vec::new(), Vec::new());
+        for (grid, errors) in pack.grids.iter().zip(errors) {
+            let peak = super::union(&errors).map_or(0.0, |r| f64::from(r.max) - f64::from(r.min));
+            let (mut active, mut all) = (Error::default(), Error::default());
+            for (frame, error) in grid.frames.iter().zip(errors) {
+                active.add(&error.active);
+                all.add(&error.all);
+                frames.push(FrameReport {
+                    grid: grid.name.clone(),
+                    frame: frame.record.number,
+                    active: Metrics::new(&error.active, peak),
+                    all: Metrics::new(&error.all, peak),
+                });
+                failures.extend(
+                    error
+                        .failure()
+                        .map(|f| format!("grid {:?} frame {}: {f}", grid.name, frame.record.number)),
+                );
+            }
+            grids.push(GridReport {
+                grid: grid.name.clone(),
+                peak,
+                active: Metrics::new(&active, peak),
+                all: Metrics::new(&all, peak),
+            });
+        }
+        let worst_frame = frames
+            .iter()
+            .filter_map(|f| {
+                f.active.psnr.map(|psnr| WorstFrame { grid: f.grid.clone(), frame: f.frame, psnr })
+            })
+            .min_by(|a, b| a.psnr.total_cmp(&b.psnr));
+        let whole = |of: fn(&GridReport) -> Metrics| grids.iter().map(of).reduce(worse);
+        Self {
+            ok: failures.is_empty(),
+            active: whole(|g| g.active).expect("a pack has a grid"),
+            all: whole(|g| g.all).expect("a pack has a grid"),
+            failures,
+            worst_frame,
+            grids,
+            frames,
+        }
+    }
+}

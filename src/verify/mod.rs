@@ -1,0 +1,114 @@
+//! Compares a pack with its source.
+//!
+//! The structure ring is [`crate::pack::Pack::open`] with [`crate::pack::Pack::check_chunks`]. The voxel
+//! ring is here: it reads the source anew and asks the pack for every leaf voxel and every tile of it,
+//! without anything that the build computed.
+
+mod compare;
+mod metrics;
+
+use std::collections::HashMap;
+use std::path::PathBuf;
+
+use rayon::prelude::*;
+
+pub use metrics::{FrameReport, GridReport, Metrics, VerifyReport, WorstFrame};
+
+use crate::error::{Error, Result};
+use crate::pack::Pack;
+use crate::stages::metadata::digest;
+use crate::stages::select::find;
+use crate::vdb::{VdbFile, with_scalar_type};
+use crate::volume::ValueRange;
+use compare::{FrameError, compare};
+
+/// Compares every voxel of every frame with the files the pack was made from, which are told by their
+/// digests. `advance` hears of each source file that is done.
+///
+/// # Errors
+/// When a source is missing, changed or unreadable, or a chunk of the pack is damaged. Differences are
+/// no error: they are in the report.
+pub fn voxels(pack: &Pack, sources: &[PathBuf], mut advance: impl FnMut(u64)) -> Result<VerifyReport> {
+    let paths = match_sources(pack, sources)?;
+    let mut errors: Vec<Vec<Option<FrameError>>> =
+        pack.grids.iter().map(|g| g.frames.iter().map(|_| None).collect()).collect();
+    let places: Vec<usize> = (0..paths.len()).collect();
+    // As many frames in memory as there are threads.
+    for window in places.chunks(rayon::current_num_threads()) {
+        let results: Vec<_> =
+            window.par_iter().map(|&source| compare_source(pack, source, &paths[source])).collect();
+        for result in results {
+            for (grid, frame, error) in result? {
+                errors[grid][frame] = Some(error);
+            }
+            advance(1);
+        }
+    }
+    let errors =
+        errors.into_iter().map(|g| g.into_iter().map(|f| f.expect("every frame has a source")).collect());
+    Ok(VerifyReport::new(pack, errors.collect()))
+}
+
+/// The file of each of the pack's sources.
+fn match_sources(pack: &Pack, sources: &[PathBuf]) -> Result<Vec<PathBuf>> {
+    let digests: Vec<_> = sources.par_iter().map(|path| digest(path).map(|(hash, _)| hash)).collect();
+    let mut by_digest = HashMap::new();
+    for (path, digest) in sources.iter().zip(digests) {
+        by_digest.insert(digest?.to_hex().to_string(), path);
+    }
+    let found = pack.provenance.sources.iter().map(|source| {
+        by_digest.get(&source.blake3).map(|path| (*path).clone()).ok_or_else(|| {
+            let same_name = sources.iter().find(|p| p.file_name().is_some_and(|n| *n == *source.file));
+            Error::Verify(match same_name {
+                Some(path) => {
+                    format!("{} has changed since the pack was built from it: build again", path.display())
+                }
+                None => format!(
+                    "frame {}: its source {:?} is not among the {} files given",
+                    source.frame,
+                    source.file,
+                    sources.len()
+                ),
+            })
+        })
+    });
+    found.collect()
+}
+
+/// Compares the frames that one source file holds: grid, frame, and what differs.
+fn compare_source(pack: &Pack, source: usize, path: &PathBuf) -> Result<Vec<(usize, usize, FrameError)>> {
+    let file = VdbFile::open(path).map_err(Error::vdb(path))?;
+    let nonfinite = pack.provenance.settings.nonfinite;
+    let mut out = Vec::new();
+    for (g, grid) in pack.grids.iter().enumerate() {
+        let of_source = |f: &crate::pack::Frame| f.record.source as usize == source;
+        for f in (0..grid.frames.len()).filter(|&f| of_source(&grid.frames[f])) {
+            let info = find(&file.grids, &grid.name).ok_or_else(|| {
+                Error::Verify(format!(
+                    "{}: grid {:?} is in the pack, but not in the file",
+                    path.display(),
+                    grid.name
+                ))
+            })?;
+            let reader = pack.frame(g, f).map_err(|e| {
+                Error::Verify(format!("grid {:?} frame {}: {e}", grid.name, grid.frames[f].record.number))
+            })?;
+            let error = with_scalar_type!(&info.value_type,
+                T => {
+                    let tree = file.read_tree::<T>(info).map_err(Error::vdb(path))?;
+                    compare(&tree, info, &reader, nonfinite)
+                },
+                other => return Err(Error::Verify(format!(
+                    "{}: grid {:?} is {} in the file", path.display(), grid.name, other.name()
+                )))
+            );
+            out.push((g, f, error));
+        }
+    }
+    Ok(out)
+}
+
+/// The range of all frames' active values.
+fn union(errors: &[FrameError]) -> Option<ValueRange> {
+    ValueRange::union_all(errors.iter().filter_map(|e| e.active_range))
+}
