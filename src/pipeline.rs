@@ -47,8 +47,8 @@ pub struct Job {
 
 /// Hears how a build is getting on. Called from one thread at a time.
 pub trait Progress {
-    /// A stage begins, which has that many steps.
-    fn stage(&mut self, name: &'static str, steps: u64);
+    /// A stage begins, which has that many steps of that kind.
+    fn stage(&mut self, name: &'static str, steps: u64, unit: &'static str);
     /// That many more steps of the stage are done.
     fn advance(&mut self, steps: u64);
     /// Something is odd but does not stop the build.
@@ -59,7 +59,7 @@ pub trait Progress {
 pub struct Silent;
 
 impl Progress for Silent {
-    fn stage(&mut self, _: &'static str, _: u64) {}
+    fn stage(&mut self, _: &'static str, _: u64, _: &'static str) {}
     fn advance(&mut self, _: u64) {}
     fn warn(&mut self, _: &str) {}
 }
@@ -81,7 +81,7 @@ pub struct Outcome {
 /// what was there before, unless only verification failed.
 pub fn build(job: &Job, progress: &mut dyn Progress) -> Result<Outcome> {
     let mut clock = Clock::new();
-    progress.stage("metadata", job.frames.len() as u64);
+    progress.stage("metadata", job.frames.len() as u64, "files");
     let sequence = metadata::read(&job.frames)?;
     let selection = select(&sequence, &job.settings.grids)?;
     let warnings = [&sequence.warnings[..], &selection.warnings].concat();
@@ -93,7 +93,7 @@ pub fn build(job: &Job, progress: &mut dyn Progress) -> Result<Outcome> {
     }
     clock.lap("metadata");
 
-    progress.stage("flatten", sequence.frames.len() as u64);
+    progress.stage("flatten", sequence.frames.len() as u64, "frames");
     let trees = flatten_and_dedup(&sequence, &selection, &job.settings, progress)?;
     clock.lap("flatten and dedup");
 
@@ -105,7 +105,7 @@ pub fn build(job: &Job, progress: &mut dyn Progress) -> Result<Outcome> {
         .collect::<Result<Vec<_>>>()?;
     let provenance = provenance(&sequence, &job.settings);
     let bricks: u64 = grids.iter().map(|g| u64::from(g.tree.pool.len())).sum();
-    progress.stage("encode", bricks);
+    progress.stage("encode", bricks, "bricks");
     let level = (job.settings.zstd != 0).then_some(job.settings.zstd);
     serialise(&job.output, &mut grids, &provenance, level, |bricks| progress.advance(bricks))
         .map_err(|e| serialise_error(e, &grids, &job.output))?;
@@ -119,7 +119,7 @@ pub fn build(job: &Job, progress: &mut dyn Progress) -> Result<Outcome> {
         }
         VerifyLevel::Voxels => {
             let pack = check_structure(&job.output)?;
-            progress.stage("verify", sequence.frames.len() as u64);
+            progress.stage("verify", sequence.frames.len() as u64, "frames");
             Some(verify::voxels(&pack, &job.frames, |frames| progress.advance(frames))?)
         }
     };

@@ -1,26 +1,11 @@
 //! The OpenVDB reader against what OpenVDB itself says of every fixture.
 
-use std::path::{Path, PathBuf};
+mod common;
 
+use common::{facts, fixtures, probes};
 use serde_json::{Value as Json, json};
 use volpack::vdb::{Accessor, Scalar, Tree, Value, VdbFile, with_scalar_type, with_value_type};
 use volpack::volume::Coord;
-
-fn fixtures() -> Vec<PathBuf> {
-    let mut files: Vec<_> = std::fs::read_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/fixtures"))
-        .unwrap()
-        .map(|entry| entry.unwrap().path())
-        .filter(|path| path.extension().is_some_and(|e| e == "vdb"))
-        .collect();
-    files.sort();
-    assert!(files.len() > 30, "the fixtures are missing");
-    files
-}
-
-fn facts(path: &Path) -> Vec<Json> {
-    let text = std::fs::read_to_string(path.with_extension("json")).unwrap();
-    serde_json::from_str::<Json>(&text).unwrap()["grids"].as_array().unwrap().clone()
-}
 
 /// Equal, numbers to 1e-12 relative: the facts are printed with 17 digits.
 fn assert_same(what: &str, ours: &Json, theirs: &Json) {
@@ -101,18 +86,11 @@ fn inactive_leaf_sum<T: Scalar>(tree: &Tree<T>) -> f64 {
 
 fn check_probes<T: Scalar>(what: &str, tree: &Tree<T>, facts: &Json) {
     let accessor = Accessor::new(tree);
-    let probes = facts["probes"].as_array().unwrap();
-    for probe in probes {
-        let at: [i32; 3] = std::array::from_fn(|a| probe[a].as_i64().unwrap() as i32);
-        let bits = u64::from_str_radix(probe[3].as_str().unwrap(), 16).unwrap();
+    for (at, expected, expected_active) in probes(facts) {
         let (value, active) = accessor.get(Coord(at));
         // A NaN's payload is not OpenVDB's to keep.
-        let expected = f64::from_bits(bits);
-        assert!(
-            value.to_f64().to_bits() == bits || value.to_f64().is_nan() && expected.is_nan(),
-            "{what} at {at:?}: {}, OpenVDB says {expected}",
-            value.to_f64()
-        );
-        assert_eq!(active, probe[4].as_bool().unwrap(), "{what} at {at:?}");
+        let same = value.to_f64().to_bits() == expected.to_bits() || value.to_f64().is_nan() && expected.is_nan();
+        assert!(same, "{what} at {at:?}: {}, OpenVDB says {expected}", value.to_f64());
+        assert_eq!(active, expected_active, "{what} at {at:?}");
     }
 }

@@ -133,6 +133,6 @@ fn print(name: &str, job: &Job, outcome: &Outcome, pack: &PackSummary, verbose: 
         }
     } else {
         let total: f64 = outcome.seconds.iter().map(|(_, s)| s).sum();
-        anstream::println!("  {GOOD}done{GOOD:#} in {total:.2} s");
+        anstream::println!("  {GOOD}done{GOOD:#} in {}", style::seconds(total));
     }
 }

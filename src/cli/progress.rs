@@ -19,7 +19,7 @@ impl Reporter {
     pub fn new(asset: &str, quiet: bool) -> Self {
         let show_bar = !quiet && std::io::stderr().is_terminal();
         let bar = show_bar.then(|| {
-            let style = ProgressStyle::with_template("{prefix} {msg:10} {bar:32} {pos}/{len} {elapsed}")
+            let style = ProgressStyle::with_template("{prefix} {msg:17} {bar:32} {human_pos}/{human_len} {elapsed}")
                 .expect("the template is valid");
             let bar = ProgressBar::new(0).with_style(style).with_prefix(asset.to_owned());
             bar.enable_steady_tick(Duration::from_millis(100));
@@ -37,14 +37,14 @@ impl Reporter {
 }
 
 impl Progress for Reporter {
-    fn stage(&mut self, name: &'static str, steps: u64) {
+    fn stage(&mut self, name: &'static str, steps: u64, unit: &'static str) {
         match &self.bar {
             Some(bar) => {
                 bar.set_position(0);
                 bar.set_length(steps);
-                bar.set_message(name);
+                bar.set_message(format!("{name}, {unit}"));
             }
-            None if !self.quiet => anstream::eprintln!("{}: {name} ({steps})", self.asset),
+            None if !self.quiet => anstream::eprintln!("{}: {name}, {steps} {unit}", self.asset),
             None => {}
         }
     }

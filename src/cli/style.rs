@@ -22,3 +22,8 @@ pub fn bytes(n: u64) -> String {
 pub fn psnr(psnr: Option<f64>) -> String {
     psnr.map_or_else(|| "exact".to_owned(), |db| format!("{db:.2} dB"))
 }
+
+/// 12 ms, or 3.4 s.
+pub fn seconds(seconds: f64) -> String {
+    if seconds < 1.0 { format!("{:.0} ms", seconds * 1e3) } else { format!("{seconds:.1} s") }
+}

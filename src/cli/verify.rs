@@ -51,7 +51,7 @@ pub fn run(args: &VerifyArgs, common: Common) -> Result<()> {
     }
     let sources = if args.source.is_empty() { sources_in_manifest(args)? } else { files(&args.source)? };
     let mut reporter = Reporter::new("verify", common.quiet || args.json);
-    reporter.stage("voxels", sources.len() as u64);
+    reporter.stage("voxels", sources.len() as u64, "frames");
     let report = verify::voxels(&pack, &sources, |frames| reporter.advance(frames));
     reporter.finish();
     let report = report?;

@@ -186,7 +186,7 @@ fn check_l1(words: &[u32], at: usize, cells: usize, nodes: u32, constants: u32) 
     if tree::ranks(mask) != ranks {
         return Err("wrong ranks".to_owned());
     }
-    if cells % 32 != 0 && mask[mask_words - 1] >> (cells % 32) != 0 {
+    if !cells.is_multiple_of(32) && mask[mask_words - 1] >> (cells % 32) != 0 {
         return Err("children outside its cells".to_owned());
     }
     let children: usize = mask.iter().map(|w| w.count_ones() as usize).sum();

@@ -78,13 +78,13 @@ pub struct Node {
 
 impl Node {
     /// How many children there are.
-    pub fn len(&self) -> usize {
+    pub fn child_count(&self) -> usize {
         self.children.iter().map(|w| w.count_ones() as usize).sum()
     }
 
     /// The node's entries in `runs`.
     pub fn entries<'a>(&self, runs: &'a Interner<u32>) -> &'a [u32] {
-        &runs.items()[self.run as usize..][..self.len()]
+        &runs.items()[self.run as usize..][..self.child_count()]
     }
 }
 

@@ -158,10 +158,16 @@ pub(super) fn skip_leaves<T: Value>(c: &mut Cursor, grid: &GridInfo, tree: &Tree
         let mask = Mask512::from_bytes(c.array("a leaf's mask")?);
         match grid.value_type {
             // LeafNode<bool>::readBuffers: origin, then the values as a mask.
-            ValueType::Bool => drop(c.take(12 + 64, "a bool leaf")?),
+            ValueType::Bool => {
+                c.take(12 + 64, "a bool leaf")?;
+            }
             // LeafNode<ValueMask>::readBuffers: origin; the mask is the value.
-            ValueType::Mask => drop(c.take(12, "a mask leaf")?),
-            _ => drop(Block::find(c, &layout, &mask.0, BRICK_VOXELS)?),
+            ValueType::Mask => {
+                c.take(12, "a mask leaf")?;
+            }
+            _ => {
+                Block::find(c, &layout, &mask.0, BRICK_VOXELS)?;
+            }
         }
     }
     Ok(())

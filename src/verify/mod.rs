@@ -8,7 +8,7 @@ mod compare;
 mod metrics;
 
 use std::collections::HashMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
@@ -76,7 +76,7 @@ fn match_sources(pack: &Pack, sources: &[PathBuf]) -> Result<Vec<PathBuf>> {
 }
 
 /// Compares the frames that one source file holds: grid, frame, and what differs.
-fn compare_source(pack: &Pack, source: usize, path: &PathBuf) -> Result<Vec<(usize, usize, FrameError)>> {
+fn compare_source(pack: &Pack, source: usize, path: &Path) -> Result<Vec<(usize, usize, FrameError)>> {
     let file = VdbFile::open(path).map_err(Error::vdb(path))?;
     let nonfinite = pack.provenance.settings.nonfinite;
     let mut out = Vec::new();

@@ -1,1 +1,54 @@
-fn main() {}
+//! Work on volpack itself: benchmarks, checks against OpenVDB, mutation runs.
+//!
+//! `cargo run --release -p xtask -- help` lists the tasks. None of them is part of the tests: they need
+//! peers from Debian (`libopenvdb-dev libboost-dev libtbb-dev libimath-dev g++`) or volumes of your own.
+
+mod formats;
+mod openvdb;
+mod peers;
+mod read;
+
+use std::error::Error;
+use std::path::PathBuf;
+
+use clap::{Parser, Subcommand};
+
+#[derive(Parser)]
+struct Cli {
+    #[command(subcommand)]
+    task: Task,
+}
+
+#[derive(Subcommand)]
+enum Task {
+    /// Measure, side by side with a peer or a setting
+    #[command(subcommand)]
+    Bench(Bench),
+    /// Compare what volpack reads with what OpenVDB reads, on any files
+    CheckOpenvdb {
+        /// OpenVDB files
+        #[arg(required = true)]
+        files: Vec<PathBuf>,
+    },
+    /// Read files once and print how long it took (what `bench read` runs)
+    #[command(hide = true)]
+    ReadOnce(read::OnceArgs),
+}
+
+#[derive(Subcommand)]
+enum Bench {
+    /// Reading time and memory beside OpenVDB's C++ io::File
+    Read(read::Args),
+    /// Every format and range on each volume: bytes, PSNR, largest error, seconds; and the tree beside
+    /// the thesis's layout
+    Formats(formats::Args),
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    match Cli::parse().task {
+        Task::Bench(Bench::Read(args)) => read::bench(&args),
+        Task::Bench(Bench::Formats(args)) => formats::bench(&args),
+        Task::CheckOpenvdb { files } => openvdb::check(&files),
+        Task::ReadOnce(args) => read::once(&args),
+    }
+}

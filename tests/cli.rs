@@ -1,0 +1,197 @@
+//! The binary, end to end.
+
+mod common;
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+use common::fixture;
+use serde_json::Value as Json;
+
+fn volpack(folder: &Path, args: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_volpack")).current_dir(folder).args(args).output().unwrap()
+}
+
+fn stdout(output: &Output) -> String {
+    assert!(output.status.success(), "{output:?}");
+    String::from_utf8(output.stdout.clone()).unwrap()
+}
+
+fn json(output: &Output) -> Json {
+    serde_json::from_str(&stdout(output)).unwrap()
+}
+
+/// The exit code and what was said of the error.
+fn failure(output: &Output) -> (i32, String) {
+    (output.status.code().unwrap(), String::from_utf8(output.stderr.clone()).unwrap())
+}
+
+fn fix(name: &str) -> String {
+    fixture(name).to_string_lossy().into_owned()
+}
+
+fn animation_glob() -> String {
+    fix("anim_*.vdb")
+}
+
+#[test]
+fn the_manifest_at_the_root_builds_and_verifies_the_fixtures() {
+    let folder = tempfile::tempdir().unwrap();
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    std::fs::copy(root.join("pipeline.toml"), folder.path().join("pipeline.toml")).unwrap();
+    let fixtures = folder.path().join("fixtures");
+    std::fs::create_dir(&fixtures).unwrap();
+    for file in common::fixtures() {
+        std::fs::copy(&file, fixtures.join(file.file_name().unwrap())).unwrap();
+    }
+    let text = stdout(&volpack(folder.path(), &["build"]));
+    assert_eq!(text.matches("verified against its source: ok").count(), 4, "{text}");
+    assert!(!text.contains('\x1b'), "colours without a terminal");
+
+    // Without --source, the manifest says where the sources are.
+    let report = json(&volpack(folder.path(), &["verify", "out/puff.volpack", "--json"]));
+    assert_eq!(report["ok"], true);
+    assert_eq!(report["frames"].as_array().unwrap().len(), 16);
+    for key in ["rmse", "psnr", "max_error", "sign_flips"] {
+        assert!(report["active"][key].is_number() && report["all"][key].is_number(), "{key}: {report}");
+    }
+
+    let one = stdout(&volpack(folder.path(), &["build", "--asset", "fog"]));
+    assert!(one.contains("fog") && !one.contains("puff"));
+    let (code, error) = failure(&volpack(folder.path(), &["build", "--asset", "fgo"]));
+    assert!(code == 2 && error.contains("ball, fog, puff, tiles"), "{code} {error}");
+}
+
+#[test]
+fn inspect_gives_every_figure() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = json(&volpack(folder.path(), &["inspect", "--json", "--values", &fix("types.vdb")]));
+    let grid = &file["grids"][0];
+    for key in [
+        "name", "type", "class", "map", "background", "leaves", "active_voxels", "root_tiles", "l1_tiles",
+        "l2_tiles", "bbox", "active_leaf_voxels", "min", "max", "sum", "nonfinite",
+    ] {
+        assert!(!grid[key].is_null(), "{key}: {grid}");
+    }
+    assert_eq!(grid["bbox"].as_array().unwrap().len(), 6);
+
+    volpack(folder.path(), &["build", &animation_glob(), "-o", "a.volpack", "-f", "bc7"]);
+    let pack = json(&volpack(folder.path(), &["inspect", "--json", "a.volpack"]));
+    for key in ["frames", "bricks", "unique_bricks", "tree_bytes", "mask_bytes", "texel_bytes", "file_bytes"] {
+        assert!(pack[key].is_u64(), "{key}: {pack}");
+    }
+    assert_eq!(pack["frames"], 8);
+    assert_eq!(pack["codecs"]["bc7"]["bytes"], pack["texel_bytes"]);
+    let sum: u64 = ["tree_bytes", "mask_bytes", "texel_bytes"].iter().map(|k| pack[k].as_u64().unwrap()).sum();
+    assert_eq!(pack["gpu_bytes"], sum);
+    assert_eq!(pack["file_bytes"], std::fs::metadata(folder.path().join("a.volpack")).unwrap().len());
+    assert!(stdout(&volpack(folder.path(), &["inspect", "a.volpack"])).contains("frames 1 to 8"));
+}
+
+#[test]
+fn the_same_input_gives_the_same_bytes() {
+    let (one, two) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    for format in ["f32", "bc4", "bc7"] {
+        let build = |folder: &Path, threads: &str| {
+            let args = ["build", &animation_glob(), "-o", "a.volpack", "-f", format, "--threads", threads];
+            stdout(&volpack(folder, &args));
+            std::fs::read(folder.join("a.volpack")).unwrap()
+        };
+        assert_eq!(build(one.path(), "1"), build(two.path(), "2"), "{format}");
+    }
+}
+
+#[test]
+fn errors_say_what_to_do_and_exit_by_kind() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let build = |file: &str, more: &[&str]| {
+        let file = fix(file);
+        let args = [&["build", &file, "-o", "x.volpack"], more].concat();
+        failure(&volpack(at, &args))
+    };
+    let expect = |(code, error): (i32, String), expected: i32, parts: &[&str]| {
+        assert!(code == expected && parts.iter().all(|p| error.contains(p)), "{code} {error}");
+    };
+    expect(build("none.vdb", &[]), 3, &["none.vdb"]);
+    expect(build("README.md", &[]), 3, &["README.md", "not an OpenVDB file"]);
+    expect(build("types.vdb", &["-g", "velocity"]), 6, &["velocity", "vec3s", "density, temperature"]);
+    expect(build("types.vdb", &["-g", "densty"]), 2, &["densty", "density (float)"]);
+    expect(build("maps.vdb", &[]), 2, &["map_affine", "--grid"]);
+    expect(build("frustum.vdb", &[]), 6, &["NonlinearFrustumMap"]);
+    expect(build("nonfinite.vdb", &[]), 3, &["density", "nonfinite = \"zero\""]);
+    expect(build("fog_half_zip.vdb", &["--format", "bc8"]), 2, &["bc7"]);
+    expect(failure(&volpack(at, &["build"])), 2, &["pipeline.toml", "-o OUT.volpack"]);
+    expect(failure(&volpack(at, &["build", &fix("tiles.vdb")])), 2, &["-o OUT.volpack"]);
+    expect(failure(&volpack(at, &["verify", "none.volpack"])), 3, &["none.volpack"]);
+    assert_eq!(std::fs::read_dir(at).unwrap().count(), 0, "something was left behind");
+
+    std::fs::write(at.join("pipeline.toml"), "[asset.a]\nframes = 'x.vdb'\nfromat = 'bc7'\n").unwrap();
+    expect(failure(&volpack(at, &["build"])), 3, &["pipeline.toml", "line 3", "`format`"]);
+
+    let help = stdout(&volpack(at, &["help"]));
+    assert!((0..=6).all(|code| help.contains(&format!("\n  {code}  "))), "{help}");
+}
+
+#[test]
+fn missing_frames_are_named_and_strict_refuses_them() {
+    let folder = tempfile::tempdir().unwrap();
+    let frames = [fix("anim_0001.vdb"), fix("anim_0002.vdb"), fix("anim_0005.vdb")];
+    let args = ["build", &frames[0], &frames[1], &frames[2], "-o", "a.volpack"];
+    let output = volpack(folder.path(), &args);
+    assert!(output.status.success());
+    assert!(failure(&output).1.contains("missing from the sequence: 3-4"));
+    let (code, error) = failure(&volpack(folder.path(), &[&args[..], &["--strict"]].concat()));
+    assert!(code == 3 && error.contains("3-4"), "{code} {error}");
+}
+
+#[test]
+fn a_bad_frame_is_named_and_the_old_pack_stays() {
+    let folder = tempfile::tempdir().unwrap();
+    for n in 1..=3 {
+        let name = format!("anim_{n:04}.vdb");
+        std::fs::copy(fixture(&name), folder.path().join(name)).unwrap();
+    }
+    let build = || volpack(folder.path(), &["build", "anim_*.vdb", "-o", "a.volpack"]);
+    stdout(&build());
+    let before = std::fs::read(folder.path().join("a.volpack")).unwrap();
+
+    let mut bytes = std::fs::read(folder.path().join("anim_0002.vdb")).unwrap();
+    bytes.truncate(bytes.len() * 3 / 4);
+    std::fs::write(folder.path().join("anim_0002.vdb"), bytes).unwrap();
+    let (code, error) = failure(&build());
+    assert!(code == 3 && error.contains("anim_0002.vdb"), "{code} {error}");
+    assert_eq!(std::fs::read(folder.path().join("a.volpack")).unwrap(), before);
+}
+
+#[test]
+fn verify_tells_a_changed_source_and_a_damaged_pack() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    std::fs::copy(fixture("fog_half_zip.vdb"), at.join("fog.vdb")).unwrap();
+    stdout(&volpack(at, &["build", "fog.vdb", "-o", "a.volpack", "-f", "bc7"]));
+    stdout(&volpack(at, &["verify", "a.volpack", "--source", "fog.vdb"]));
+    stdout(&volpack(at, &["verify", "a.volpack", "--level", "structure"]));
+    let (code, error) = failure(&volpack(at, &["verify", "a.volpack"]));
+    assert!(code == 2 && error.contains("--source"), "{code} {error}");
+
+    std::fs::copy(fixture("fog_half_blosc.vdb"), at.join("fog.vdb")).unwrap();
+    let (code, error) = failure(&volpack(at, &["verify", "a.volpack", "--source", "fog.vdb"]));
+    assert!(code == 4 && error.contains("fog.vdb has changed"), "{code} {error}");
+
+    let mut bytes = std::fs::read(at.join("a.volpack")).unwrap();
+    let last = bytes.len() - 1;
+    bytes[last] ^= 1;
+    std::fs::write(at.join("a.volpack"), bytes).unwrap();
+    let (code, error) = failure(&volpack(at, &["verify", "a.volpack", "--source", "fog.vdb"]));
+    assert!(code == 3 && error.contains("digest"), "{code} {error}");
+}
+
+#[test]
+fn a_level_set_whose_sign_flips_fails() {
+    let folder = tempfile::tempdir().unwrap();
+    let coarse = ["-o", "a.volpack", "-f", "bc4", "-r", "sequence"];
+    let output = volpack(folder.path(), &[&["build", &fix("levelset_half.vdb")], &coarse[..]].concat());
+    let (code, error) = failure(&output);
+    assert!(code == 4 && error.contains("flipped"), "{code} {error}");
+}

@@ -1,0 +1,56 @@
+//! What several tests need: fixtures, what OpenVDB says of them, and quick builds.
+
+#![allow(dead_code)] // Each test file uses a part of it.
+
+use std::path::{Path, PathBuf};
+
+use serde_json::Value as Json;
+use volpack::pack::Pack;
+use volpack::pipeline::{Job, Silent, VerifyLevel, build};
+use volpack::settings::Settings;
+use volpack::verify::VerifyReport;
+
+/// A file of the fixtures' folder.
+pub fn fixture(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("fixtures").join(name)
+}
+
+/// Every OpenVDB fixture, sorted by name.
+pub fn fixtures() -> Vec<PathBuf> {
+    let mut files: Vec<_> = std::fs::read_dir(fixture(""))
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.extension().is_some_and(|e| e == "vdb"))
+        .collect();
+    files.sort();
+    assert!(files.len() > 30, "the fixtures are missing");
+    files
+}
+
+/// The eight frames of the animation.
+pub fn animation() -> Vec<PathBuf> {
+    (1..=8).map(|n| fixture(&format!("anim_{n:04}.vdb"))).collect()
+}
+
+/// What OpenVDB says of each grid of a file.
+pub fn facts(path: &Path) -> Vec<Json> {
+    let text = std::fs::read_to_string(path.with_extension("json")).unwrap();
+    serde_json::from_str::<Json>(&text).unwrap()["grids"].as_array().unwrap().clone()
+}
+
+/// One of the voxels that OpenVDB was asked for: where, value, active.
+pub fn probes(facts: &Json) -> impl Iterator<Item = ([i32; 3], f64, bool)> + '_ {
+    facts["probes"].as_array().unwrap().iter().map(|probe| {
+        let at = std::array::from_fn(|a| probe[a].as_i64().unwrap() as i32);
+        let bits = u64::from_str_radix(probe[3].as_str().unwrap(), 16).unwrap();
+        (at, f64::from_bits(bits), probe[4].as_bool().unwrap())
+    })
+}
+
+/// Builds a pack of `frames` in a folder that the caller keeps, and compares every voxel.
+pub fn build_verified(frames: &[PathBuf], settings: Settings, folder: &Path) -> (Pack, VerifyReport) {
+    let output = folder.join("test.volpack");
+    let job = Job { frames: frames.to_vec(), output, settings, strict: false, verify: VerifyLevel::Voxels };
+    let outcome = build(&job, &mut Silent).unwrap_or_else(|e| panic!("{frames:?}: {e}"));
+    (Pack::open(&job.output).unwrap(), outcome.verification.unwrap())
+}

@@ -1,0 +1,37 @@
+//! Compiles the small C++ programs that run a peer's own code.
+
+use std::error::Error;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// The repository's root.
+pub fn root() -> &'static Path {
+    Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask lies in the repository")
+}
+
+/// Compiles a program against OpenVDB into `target/peers` and returns where it is.
+///
+/// # Errors
+/// When there is no compiler or no OpenVDB: the message says what to install.
+pub fn compile_openvdb(source: &str) -> Result<PathBuf, Box<dyn Error>> {
+    let source = root().join(source);
+    let folder = root().join("target/peers");
+    std::fs::create_dir_all(&folder)?;
+    let program = folder.join(source.file_stem().expect("a source file"));
+    let fresh = |path: &Path| path.metadata().and_then(|m| m.modified()).ok();
+    if fresh(&program) > fresh(&source) {
+        return Ok(program);
+    }
+    let status = Command::new("g++")
+        .args(["-O2", "-std=c++17", "-Wno-deprecated-declarations"])
+        .arg(&source)
+        .arg("-o")
+        .arg(&program)
+        .args(["-lopenvdb", "-ltbb", "-lImath-3_1"])
+        .status();
+    match status {
+        Ok(status) if status.success() => Ok(program),
+        _ => Err("OpenVDB is not installed: apt-get install g++ libopenvdb-dev libboost-dev libtbb-dev libimath-dev"
+            .into()),
+    }
+}
