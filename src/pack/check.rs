@@ -116,16 +116,16 @@ pub(super) fn grid_header(
     let one_root = grid.roots == [1; 3];
     let cells_fit = grid.cells.iter().all(|c| (1..=32).contains(c)) && (one_root || grid.cells == [32; 3]);
     let extent = |a: usize| i64::from(grid.cells[a]) * i64::from(grid.roots[a]) * i64::from(CELL_DIM);
-    let box_fits = (0..3)
-        .all(|a| grid.roots[a] >= 1 && i64::from(grid.origin.0[a]) + extent(a) <= i64::from(i32::MAX) + 1);
+    // Wrong cells could make the extent wrap.
+    let box_fits = cells_fit
+        && (0..3).all(|a| {
+            grid.roots[a] >= 1 && i64::from(grid.origin.0[a]) + extent(a) <= i64::from(i32::MAX) + 1
+        });
     let roots = grid.roots.iter().try_fold(u64::from(h[grid::FRAMES]), |n, r| n.checked_mul((*r).into()));
-    let roots_fit = roots.is_some_and(|n| n <= (words.len() - grid.root_at.min(words.len())) as u64);
-    if !cells_fit
-        || !box_fits
-        || !roots_fit
-        || !grid.origin.is_aligned(CELL_DIM)
-        || h[grid::FRAMES] != record.frames
-    {
+    // A grid without frames has no roots, but they too begin inside.
+    let room = words.len().checked_sub(grid.root_at);
+    let roots_fit = roots.zip(room).is_some_and(|(roots, room)| roots <= room as u64);
+    if !box_fits || !roots_fit || !grid.origin.is_aligned(CELL_DIM) || h[grid::FRAMES] != record.frames {
         return corrupt(format!("grid {name:?} has an impossible header"));
     }
     if !(grid.sequence.lo.is_finite() && grid.sequence.span.is_finite() && grid.sequence.span > 0.0) {
@@ -139,9 +139,14 @@ pub(super) fn grids(pack: &Pack) -> Result<(), PackError> {
     let words = &pack.tree;
     let constants = words[header::CONSTANTS];
     let nodes = words[header::NODES];
+    // No root serves twice, or a small file could take any time to check.
+    let all_roots = pack.grids.iter().map(|g| g.root_count() * g.frames.len()).sum::<usize>();
+    if all_roots > words.len() {
+        return corrupt("the grids' roots overlap");
+    }
     for grid in &pack.grids {
-        let cells = grid.cells.iter().product::<u32>() as usize;
-        let roots = grid.roots.iter().map(|r| *r as usize).product::<usize>() * grid.frames.len();
+        let cells = grid.cell_count();
+        let roots = grid.root_count() * grid.frames.len();
         let mut seen = HashSet::new();
         for &word in &words[grid.root_at..grid.root_at + roots] {
             match Link::from_word(word) {

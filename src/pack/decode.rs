@@ -64,6 +64,38 @@ impl Pack {
     pub fn frame_tree(&self, grid: usize, frame: usize) -> FrameReader<'_> {
         FrameReader { pack: self, grid, frame, slabs: HashMap::new() }
     }
+
+    /// How many 8³ regions all frames have, shared ones counted each time.
+    ///
+    /// Takes as long as the tree is, not as what it stands for: a few nodes that name each other often
+    /// are more regions than anyone could visit.
+    pub fn region_count(&self) -> u64 {
+        let words = &self.tree;
+        let ones = |mask: &[u32]| mask.iter().map(|w| u64::from(w.count_ones())).sum::<u64>();
+        let nodes = words[words[header::NODE_AT] as usize..].chunks_exact(NODE_WORDS);
+        let in_node: Vec<u64> =
+            nodes.take(words[header::NODES] as usize).map(|node| ones(&node[..128])).collect();
+        let mut total = 0u64;
+        for grid in &self.grids {
+            let (mask_words, rank_words) = l1_words(grid.cell_count());
+            let mut in_l1: HashMap<u32, u64> = HashMap::new();
+            let roots = grid.root_count() * grid.frames.len();
+            for &root in &words[grid.root_at..grid.root_at + roots] {
+                let Link::Node(l1 @ 1..) = Link::from_word(root) else { continue };
+                let count = in_l1.entry(l1).or_insert_with(|| {
+                    let (mask, rest) = words[l1 as usize..].split_at(mask_words);
+                    let links = rest[rank_words..].iter().take(ones(mask) as usize);
+                    let nodes = links.map(|&link| match Link::from_word(link) {
+                        Link::Node(node) => in_node[node as usize],
+                        Link::Constant { .. } => 0,
+                    });
+                    nodes.sum()
+                });
+                total = total.saturating_add(*count);
+            }
+        }
+        total
+    }
 }
 
 impl FrameReader<'_> {
@@ -101,16 +133,15 @@ impl FrameReader<'_> {
             root = root * roots as usize + (index / cells) as usize;
             cell = cell * cells as usize + (index % cells) as usize;
         }
-        let roots: usize = grid.roots.iter().map(|r| *r as usize).product();
         let words = self.words();
-        let l1 = match Link::from_word(words[grid.root_at + self.frame * roots + root]) {
+        let l1 = match Link::from_word(words[grid.root_at + self.frame * grid.root_count() + root]) {
             Link::Node(0) => return (Region::Background, ROOT_DIM),
             Link::Constant { index, active } => {
                 return (Region::Constant(self.constant(index, active)), ROOT_DIM);
             }
             Link::Node(l1) => l1 as usize,
         };
-        let (mask_words, rank_words) = l1_words(grid.cells.iter().product::<u32>() as usize);
+        let (mask_words, rank_words) = l1_words(grid.cell_count());
         let (mask, rest) = words[l1..].split_at(mask_words);
         let Some(rank) = tree::rank(mask, rest, cell) else { return (Region::Background, CELL_DIM) };
         match Link::from_word(rest[rank_words + rank as usize]) {
@@ -141,9 +172,9 @@ impl FrameReader<'_> {
         let grid = self.grid();
         let words = self.words();
         let [rx, ry, rz] = grid.roots;
-        let [cx, cy, cz] = grid.cells.map(|c| c as i32);
+        let [_, cy, cz] = grid.cells.map(|c| c as i32);
         let roots = (0..rx).flat_map(|x| (0..ry).flat_map(move |y| (0..rz).map(move |z| [x, y, z])));
-        let root_count = (rx * ry * rz) as usize;
+        let root_count = grid.root_count();
         for (i, root) in roots.enumerate() {
             let origin = grid.origin.offset_by(std::array::from_fn(|a| root[a] as i32 * ROOT_DIM));
             let l1 = match Link::from_word(words[grid.root_at + self.frame * root_count + i]) {
@@ -154,7 +185,7 @@ impl FrameReader<'_> {
                 }
                 Link::Node(l1) => l1 as usize,
             };
-            let (mask_words, rank_words) = l1_words((cx * cy * cz) as usize);
+            let (mask_words, rank_words) = l1_words(grid.cell_count());
             let links = &words[l1 + mask_words + rank_words..];
             let cells = set_bits(&words[l1..l1 + mask_words]);
             for (&link, cell) in links.iter().zip(cells) {

@@ -96,6 +96,18 @@ pub struct Frame {
     pub chunks: Vec<u32>,
 }
 
+impl Grid {
+    /// L1 nodes of a frame.
+    pub(super) fn root_count(&self) -> usize {
+        self.roots.iter().map(|r| *r as usize).product()
+    }
+
+    /// 128³ cells of an L1 node.
+    pub(super) fn cell_count(&self) -> usize {
+        self.cells.iter().map(|c| *c as usize).product()
+    }
+}
+
 fn corrupt<T>(what: impl Into<String>) -> Result<T, PackError> {
     Err(PackError::Corrupt(what.into()))
 }
@@ -191,6 +203,13 @@ impl Pack {
         let names = self.whole_section(kind::NAMES)?;
         if records.len() != self.tree[super::tree::header::GRIDS] as usize {
             return corrupt("the grid table and the tree disagree about the number of grids");
+        }
+        // Names and lists lie end to end. Were the same bytes to serve many, a small file could take all
+        // memory.
+        let name_bytes: u64 = records.iter().map(|r| u64::from(r.name_bytes)).sum();
+        let list_words: u64 = frames.iter().map(|f| u64::from(f.chunks)).sum();
+        if name_bytes > names.len() as u64 || list_words > lists.len() as u64 {
+            return corrupt("the grids' names or the frames' chunk lists overlap");
         }
         let mut out = Vec::with_capacity(records.len());
         for (g, record) in records.iter().enumerate() {
@@ -383,6 +402,10 @@ fn read_tables(bytes: &[u8]) -> Result<(Vec<Section>, Vec<Chunk>), PackError> {
         if section.offset < at || section.chunk_bytes == 0 || section.chunk_bytes > MAX_CHUNK {
             return corrupt(format!("the {name} overlaps what is before it"));
         }
+        // Also keeps every sum of an offset and a length below from wrapping.
+        if section.offset > have {
+            return corrupt(format!("the {name} begins behind the end of the file"));
+        }
         let entries = &chunks[chunk_range(section)];
         if *blake3::hash(bytemuck::cast_slice(entries)).as_bytes() != section.digest {
             return Err(PackError::Digest { what: format!("the {name}'s chunk table") });
@@ -400,7 +423,12 @@ fn read_tables(bytes: &[u8]) -> Result<(Vec<Section>, Vec<Chunk>), PackError> {
             } else {
                 chunk.raw_bytes == section.chunk_bytes
             };
-            if chunk.offset != at || !size_fits || chunk.stored_bytes > chunk.raw_bytes {
+            let stored_fits = if section.encoding == encoding::RAW {
+                chunk.stored_bytes == chunk.raw_bytes
+            } else {
+                chunk.stored_bytes <= chunk.raw_bytes
+            };
+            if chunk.offset != at || !size_fits || !stored_fits {
                 return corrupt(format!("chunk {i} of the {name} does not lie where it should"));
             }
             at += u64::from(chunk.stored_bytes);

@@ -5,8 +5,8 @@ use std::collections::{BTreeMap, BTreeSet, HashSet};
 use serde::Serialize;
 
 use crate::codec::Codec;
+use crate::pack::Pack;
 use crate::pack::tree::{MASK_WORDS, RECORD_WORDS, header};
-use crate::pack::{Pack, Region};
 
 /// A pack's sizes and counts.
 #[derive(Clone, Debug, Serialize)]
@@ -64,17 +64,11 @@ impl PackSummary {
             codecs.entry(atlas.codec.name()).or_default().bytes = atlas.bytes();
         }
 
-        let mut bricks = 0;
-        let mut frames = BTreeSet::new();
-        let mut source_leaves = 0;
-        for (g, grid) in pack.grids.iter().enumerate() {
-            for (f, frame) in grid.frames.iter().enumerate() {
-                frames.insert(frame.record.number);
-                source_leaves += frame.record.leaves;
-                let count = |_, _, region| bricks += u64::from(matches!(region, Region::Brick(_)));
-                pack.frame_tree(g, f).for_each_region(count);
-            }
-        }
+        let frames: BTreeSet<i32> =
+            pack.grids.iter().flat_map(|g| g.frames.iter().map(|f| f.record.number)).collect();
+        // Nothing in a pack bounds what it says of its source.
+        let leaves = pack.grids.iter().flat_map(|g| g.frames.iter().map(|f| f.record.leaves));
+        let source_leaves = leaves.fold(0, u64::saturating_add);
         let mask_bytes = u64::from(words[header::MASKS]) * MASK_WORDS as u64 * 4;
         let tree_bytes = words.len() as u64 * 4 - mask_bytes;
         let texel_bytes = pack.atlases.iter().map(crate::pack::Atlas::bytes).sum();
@@ -82,7 +76,7 @@ impl PackSummary {
         Self {
             grids: pack.grids.iter().map(|g| g.name.clone()).collect(),
             frames: frames.len() as u64,
-            bricks,
+            bricks: pack.region_count(),
             unique_bricks: unique.len() as u64,
             codecs,
             tree_bytes,
@@ -93,7 +87,7 @@ impl PackSummary {
             bits_per_voxel: if source_leaves == 0 {
                 0.0
             } else {
-                gpu_bytes as f64 * 8.0 / (512 * source_leaves) as f64
+                gpu_bytes as f64 * 8.0 / (512.0 * source_leaves as f64)
             },
             l2_nodes: words[header::NODES].into(),
             source_leaves,

@@ -1,7 +1,7 @@
 //! Every format and range on each volume, and the tree beside the thesis's layout.
 
 use std::error::Error;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use volpack::pack::Pack;
@@ -26,8 +26,10 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     println!("| volume | format | range | GPU KiB | bits/voxel | PSNR dB | largest error / peak | build s |");
     println!("|---|---|---|---|---|---|---|---|");
     for sequence in &args.sequences {
-        let name = sequence.file_stem().map(|s| s.to_string_lossy().into_owned()).unwrap_or_default();
         let frames = volpack::manifest::expand(std::slice::from_ref(sequence))?;
+        // A sequence goes by its folder's name.
+        let named = if frames.len() == 1 { sequence.file_stem() } else { sequence.parent().and_then(Path::file_name) };
+        let name = named.unwrap_or_default().to_string_lossy().into_owned();
         for format in Format::ALL {
             for range in [RangeMode::Brick, RangeMode::Sequence] {
                 if range == RangeMode::Sequence && !format.codec().is_normalised() {
