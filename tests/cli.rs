@@ -68,8 +68,22 @@ fn inspect_gives_every_figure() {
     let file = json(&volpack(folder.path(), &["inspect", "--json", "--values", &fix("types.vdb")]));
     let grid = &file["grids"][0];
     for key in [
-        "name", "type", "class", "map", "background", "leaves", "active_voxels", "root_tiles", "l1_tiles",
-        "l2_tiles", "bbox", "active_leaf_voxels", "min", "max", "sum", "nonfinite",
+        "name",
+        "type",
+        "class",
+        "map",
+        "background",
+        "leaves",
+        "active_voxels",
+        "root_tiles",
+        "l1_tiles",
+        "l2_tiles",
+        "bbox",
+        "active_leaf_voxels",
+        "min",
+        "max",
+        "sum",
+        "nonfinite",
     ] {
         assert!(!grid[key].is_null(), "{key}: {grid}");
     }
@@ -77,12 +91,14 @@ fn inspect_gives_every_figure() {
 
     volpack(folder.path(), &["build", &animation_glob(), "-o", "a.volpack", "-f", "bc7"]);
     let pack = json(&volpack(folder.path(), &["inspect", "--json", "a.volpack"]));
-    for key in ["frames", "bricks", "unique_bricks", "tree_bytes", "mask_bytes", "texel_bytes", "file_bytes"] {
+    for key in ["frames", "bricks", "unique_bricks", "tree_bytes", "mask_bytes", "texel_bytes", "file_bytes"]
+    {
         assert!(pack[key].is_u64(), "{key}: {pack}");
     }
     assert_eq!(pack["frames"], 8);
     assert_eq!(pack["codecs"]["bc7"]["bytes"], pack["texel_bytes"]);
-    let sum: u64 = ["tree_bytes", "mask_bytes", "texel_bytes"].iter().map(|k| pack[k].as_u64().unwrap()).sum();
+    let sum: u64 =
+        ["tree_bytes", "mask_bytes", "texel_bytes"].iter().map(|k| pack[k].as_u64().unwrap()).sum();
     assert_eq!(pack["gpu_bytes"], sum);
     assert_eq!(pack["file_bytes"], std::fs::metadata(folder.path().join("a.volpack")).unwrap().len());
     assert!(stdout(&volpack(folder.path(), &["inspect", "a.volpack"])).contains("frames 1 to 8"));

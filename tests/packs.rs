@@ -38,7 +38,8 @@ fn f32_packs_say_what_openvdb_says() {
             if !grid.value_type.is_scalar() || grid.transform.matrix.is_none() {
                 continue;
             }
-            let (pack, report) = build_verified(&[path.clone()], settings(&grid.name, Format::F32), folder.path());
+            let (pack, report) =
+                build_verified(std::slice::from_ref(&path), settings(&grid.name, Format::F32), folder.path());
             let what = format!("{} {}", path.display(), grid.name);
             assert!(report.ok, "{what}: {:?}", report.failures);
             assert_eq!((report.active.max_error, report.all.max_error), (0.0, 0.0), "{what}");
@@ -66,12 +67,14 @@ fn every_format_keeps_its_promise_on_every_fixture() {
             for format in [Format::F16, Format::Unorm8, Format::Bc4, Format::Bc7] {
                 // A coarse level set may well flip signs; that is a failure of its own.
                 let too_coarse = path.ends_with("levelset_half.vdb") || path.ends_with("levelset_float.vdb");
-                if format == Format::F16 && !in_half || too_coarse && matches!(format, Format::Bc4 | Format::Bc7) {
+                if format == Format::F16 && !in_half
+                    || too_coarse && matches!(format, Format::Bc4 | Format::Bc7)
+                {
                     continue;
                 }
                 for masks in [Masks::Auto, Masks::Keep] {
                     let settings = Settings { masks, ..settings(&grid.name, format) };
-                    let (_, report) = build_verified(&[path.clone()], settings, folder.path());
+                    let (_, report) = build_verified(std::slice::from_ref(&path), settings, folder.path());
                     let what = format!("{} {} {format:?} {masks:?}", path.display(), grid.name);
                     assert!(report.ok, "{what}: {:?}", report.failures);
                     if format == Format::F16 && grid.half {
@@ -114,7 +117,8 @@ fn what_frames_share_is_stored_once() {
             copy
         })
         .collect();
-    let one = PackSummary::new(&build_verified(&still[..1], settings("density", Format::F32), folder.path()).0);
+    let one =
+        PackSummary::new(&build_verified(&still[..1], settings("density", Format::F32), folder.path()).0);
     let eight = PackSummary::new(&build_verified(&still, settings("density", Format::F32), folder.path()).0);
     assert_eq!(eight.bricks, 8 * one.bricks);
     assert_eq!((eight.unique_bricks, eight.texel_bytes), (one.unique_bricks, one.texel_bytes));
@@ -126,7 +130,10 @@ fn a_frame_reads_no_chunks_but_its_own() {
     let folder = tempfile::tempdir().unwrap();
     let (pack, _) = build_verified(&animation(), settings("density", Format::F32), folder.path());
     let chunks: Vec<_> = pack.grids[0].frames.iter().map(|f| f.chunks.len()).collect();
-    assert!(chunks.iter().all(|n| *n > 0 && *n <= pack.atlas(Codec::F32).unwrap().slabs as usize), "{chunks:?}");
+    assert!(
+        chunks.iter().all(|n| *n > 0 && *n <= pack.atlas(Codec::F32).unwrap().slabs as usize),
+        "{chunks:?}"
+    );
     // Decoding with only the listed chunks loaded is what verification did; a frame that listed too
     // few would have failed it.
 }
@@ -161,6 +168,26 @@ fn several_grids_keep_their_own_frames_and_ranges() {
     assert_eq!(names, [("temperature", 8, 24.0), ("density", 9, 24.0)]);
     assert_eq!(pack.grids[1].frames[8].record.number, 99);
     assert_ne!(pack.grids[0].sequence, pack.grids[1].sequence);
+}
+
+#[test]
+fn an_empty_frame_is_a_frame() {
+    let folder = tempfile::tempdir().unwrap();
+    // The empty grid comes first, in the middle and last.
+    let frames: Vec<_> = ["empty", "fog_half_zip", "empty", "anim_0003", "empty"]
+        .iter()
+        .enumerate()
+        .map(|(n, name)| {
+            let copy = folder.path().join(format!("frame_{n}.vdb"));
+            std::fs::copy(fixture(&format!("{name}.vdb")), &copy).unwrap();
+            copy
+        })
+        .collect();
+    let (pack, report) = build_verified(&frames, settings("density", Format::Bc7), folder.path());
+    assert!(report.ok, "{:?}", report.failures);
+    let leaves: Vec<_> = pack.grids[0].frames.iter().map(|f| f.record.leaves > 0).collect();
+    assert_eq!(leaves, [false, true, false, true, false]);
+    assert!(pack.grids[0].frames[0].chunks.is_empty());
 }
 
 #[test]

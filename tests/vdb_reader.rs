@@ -89,7 +89,8 @@ fn check_probes<T: Scalar>(what: &str, tree: &Tree<T>, facts: &Json) {
     for (at, expected, expected_active) in probes(facts) {
         let (value, active) = accessor.get(Coord(at));
         // A NaN's payload is not OpenVDB's to keep.
-        let same = value.to_f64().to_bits() == expected.to_bits() || value.to_f64().is_nan() && expected.is_nan();
+        let same =
+            value.to_f64().to_bits() == expected.to_bits() || value.to_f64().is_nan() && expected.is_nan();
         assert!(same, "{what} at {at:?}: {}, OpenVDB says {expected}", value.to_f64());
         assert_eq!(active, expected_active, "{what} at {at:?}");
     }

@@ -19,8 +19,9 @@ impl Reporter {
     pub fn new(asset: &str, quiet: bool) -> Self {
         let show_bar = !quiet && std::io::stderr().is_terminal();
         let bar = show_bar.then(|| {
-            let style = ProgressStyle::with_template("{prefix} {msg:17} {bar:32} {human_pos}/{human_len} {elapsed}")
-                .expect("the template is valid");
+            let style =
+                ProgressStyle::with_template("{prefix} {msg:17} {bar:32} {human_pos}/{human_len} {elapsed}")
+                    .expect("the template is valid");
             let bar = ProgressBar::new(0).with_style(style).with_prefix(asset.to_owned());
             bar.enable_steady_tick(Duration::from_millis(100));
             bar
@@ -44,7 +45,10 @@ impl Progress for Reporter {
                 bar.set_length(steps);
                 bar.set_message(format!("{name}, {unit}"));
             }
-            None if !self.quiet => anstream::eprintln!("{}: {name}, {steps} {unit}", self.asset),
+            None if !self.quiet => {
+                let unit = if steps == 1 { unit.trim_end_matches('s') } else { unit };
+                anstream::eprintln!("{}: {name}, {steps} {unit}", self.asset);
+            }
             None => {}
         }
     }

@@ -5,13 +5,12 @@
 
 use intel_tex_2::RSurface;
 
+use super::blocks::by_slice;
 use super::plain::{texel_order, texel_order_mut, unorm8};
 use super::{SequenceRange, Texels};
 use crate::volume::BRICK_VOXELS;
 
 const BLOCK: usize = 8;
-/// Bytes of a brick: 8 slices of 2 × 2 blocks.
-const BRICK: usize = 8 * 4 * BLOCK;
 /// Texels across the surface of one brick: its 8 slices side by side, the encoder's least width.
 const WIDTH: usize = 64;
 
@@ -29,16 +28,7 @@ pub(super) fn encode(sequence: &SequenceRange, batch: &[Texels]) -> Vec<u8> {
         height: 8,
         stride: width as u32,
     });
-
-    // From block rows across the whole surface to the blocks of one brick after another.
-    let mut out = Vec::with_capacity(batch.len() * BRICK);
-    let row = |r: usize| &blocks[r * (width / 4) * BLOCK..];
-    for slice in 0..batch.len() * 8 {
-        for r in 0..2 {
-            out.extend(&row(r)[slice * 2 * BLOCK..][..2 * BLOCK]);
-        }
-    }
-    out
+    by_slice(&blocks, width, BLOCK, batch.len() * 8)
 }
 
 pub(super) fn decode(bytes: &[u8], out: &mut [f32; BRICK_VOXELS]) {

@@ -8,6 +8,7 @@
 use intel_tex_2::RgbaSurface;
 use ndarray::{ArrayView3, ArrayViewMut3};
 
+use super::blocks::by_slice;
 use super::plain::unorm8;
 use super::{Encoded, SequenceRange, Texels};
 use crate::volume::BRICK_VOXELS;
@@ -73,16 +74,7 @@ fn encode_axis(bricks: &[[u8; BRICK_VOXELS]], axis: u8) -> Vec<u8> {
         &settings,
         &RgbaSurface { data: &surface, width: width as u32, height: 8, stride: width as u32 * 4 },
     );
-
-    // From block rows across the whole surface to the blocks of one brick after another.
-    let mut out = Vec::with_capacity(bricks.len() * BRICK);
-    let row = |r: usize| &blocks[r * (width / 4) * BLOCK..];
-    for slice in 0..bricks.len() * 2 {
-        for r in 0..2 {
-            out.extend(&row(r)[slice * 2 * BLOCK..][..2 * BLOCK]);
-        }
-    }
-    out
+    by_slice(&blocks, width, BLOCK, bricks.len() * 2)
 }
 
 pub(super) fn decode(bytes: &[u8], axis: u8, out: &mut [f32; BRICK_VOXELS]) {

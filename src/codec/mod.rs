@@ -6,6 +6,7 @@
 
 mod bc4;
 mod bc7;
+mod blocks;
 mod plain;
 mod range;
 

@@ -3,6 +3,7 @@
 use std::collections::HashSet;
 use std::ops::Range;
 
+use super::error::corrupt;
 use super::layout::GridRecord;
 use super::tree::{
     self, GRID_WORDS, HEADER_WORDS, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS, grid, header,
@@ -11,10 +12,6 @@ use super::tree::{
 use super::{Grid, Pack, PackError};
 use crate::codec::{Codec, SequenceRange};
 use crate::volume::{CELL_DIM, Coord, InactiveRule};
-
-fn corrupt<T>(what: impl Into<String>) -> Result<T, PackError> {
-    Err(PackError::Corrupt(what.into()))
-}
 
 /// The words of the tree that a header entry names.
 fn area(words: &[u32], at: usize, count: usize, size: usize, what: &str) -> Result<Range<usize>, PackError> {

@@ -37,3 +37,8 @@ impl PackError {
         matches!(self, Self::Version(_))
     }
 }
+
+/// The error for a value that contradicts the format.
+pub(super) fn corrupt<T>(what: impl Into<String>) -> Result<T, PackError> {
+    Err(PackError::Corrupt(what.into()))
+}

@@ -9,6 +9,7 @@ mod error;
 pub mod layout;
 mod provenance;
 mod reader;
+mod tables;
 pub mod tree;
 mod writer;
 

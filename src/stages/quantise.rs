@@ -12,8 +12,8 @@ use crate::codec::{OutOfRange, Texels, encode};
 use crate::pack::Atlas;
 use crate::volume::{Brick, InactiveRule};
 
-/// Bricks that are in memory at once: 16 MB of voxels, enough slabs for every core.
-const BRICKS_IN_FLIGHT: u32 = 8192;
+/// Bricks that are in memory at once: 8 MB of voxels, enough batches for every core.
+const BRICKS_IN_FLIGHT: u32 = 4096;
 
 /// One grid's bricks and where they begin in the atlas.
 pub struct GridBricks<'a> {

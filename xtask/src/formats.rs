@@ -28,7 +28,11 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     for sequence in &args.sequences {
         let frames = volpack::manifest::expand(std::slice::from_ref(sequence))?;
         // A sequence goes by its folder's name.
-        let named = if frames.len() == 1 { sequence.file_stem() } else { sequence.parent().and_then(Path::file_name) };
+        let named = if frames.len() == 1 {
+            sequence.file_stem()
+        } else {
+            sequence.parent().and_then(Path::file_name)
+        };
         let name = named.unwrap_or_default().to_string_lossy().into_owned();
         for format in Format::ALL {
             for range in [RangeMode::Brick, RangeMode::Sequence] {
@@ -37,7 +41,13 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 }
                 let settings = Settings { format, range, ..Settings::default() };
                 let output = folder.path().join("bench.volpack");
-                let mut job = Job { frames: frames.clone(), output, settings, strict: false, verify: VerifyLevel::None };
+                let mut job = Job {
+                    frames: frames.clone(),
+                    output,
+                    settings,
+                    strict: false,
+                    verify: VerifyLevel::None,
+                };
                 let start = Instant::now();
                 build(&job, &mut Silent)?;
                 let seconds = start.elapsed().as_secs_f64();

@@ -13,8 +13,21 @@ use crate::peers;
 
 /// Keys that must be equal, numbers to this relative difference: both sides print 17 digits.
 const KEYS: [&str; 15] = [
-    "type", "half", "class", "map", "matrix", "background", "leaves", "active_voxels", "root_tiles", "l1_tiles",
-    "l2_tiles", "bbox", "active_leaf_voxels", "min", "max",
+    "type",
+    "half",
+    "class",
+    "map",
+    "matrix",
+    "background",
+    "leaves",
+    "active_voxels",
+    "root_tiles",
+    "l1_tiles",
+    "l2_tiles",
+    "bbox",
+    "active_leaf_voxels",
+    "min",
+    "max",
 ];
 const TOLERANCE: f64 = 1e-12;
 /// Sums are added in another order.
@@ -45,7 +58,9 @@ pub fn check(files: &[PathBuf]) -> Result<(), Box<dyn Error>> {
                 .iter()
                 .map(|key| (key, TOLERANCE))
                 .chain([(&"sum", SUM_TOLERANCE), (&"nonfinite", 0.0)])
-                .filter(|(key, tolerance)| !theirs[**key].is_null() && !same(&ours[**key], &theirs[**key], *tolerance));
+                .filter(|(key, tolerance)| {
+                    !theirs[**key].is_null() && !same(&ours[**key], &theirs[**key], *tolerance)
+                });
             for (key, _) in wrong {
                 println!("{} {} {key}: {}, OpenVDB {}", path.display(), ours["name"], ours[key], theirs[key]);
                 differences += 1;
@@ -61,7 +76,9 @@ pub fn check(files: &[PathBuf]) -> Result<(), Box<dyn Error>> {
 
 fn same(a: &Json, b: &Json, tolerance: f64) -> bool {
     match (a, b) {
-        (Json::Array(a), Json::Array(b)) => a.len() == b.len() && a.iter().zip(b).all(|(a, b)| same(a, b, tolerance)),
+        (Json::Array(a), Json::Array(b)) => {
+            a.len() == b.len() && a.iter().zip(b).all(|(a, b)| same(a, b, tolerance))
+        }
         (Json::Number(a), Json::Number(b)) => {
             let (a, b) = (a.as_f64().unwrap_or(f64::NAN), b.as_f64().unwrap_or(f64::NAN));
             (a - b).abs() <= tolerance * b.abs()

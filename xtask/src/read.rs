@@ -117,7 +117,9 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
 /// The median over processes of each process's median read. Shared machines are noisy; both sides
 /// are treated alike.
 fn median_ms(runs: &[Json]) -> f64 {
-    let of_run = |run: &Json| median(run["seconds"].as_array().into_iter().flatten().filter_map(Json::as_f64).collect());
+    let of_run = |run: &Json| {
+        median(run["seconds"].as_array().into_iter().flatten().filter_map(Json::as_f64).collect())
+    };
     median(runs.iter().map(of_run).collect()) * 1e3
 }
 

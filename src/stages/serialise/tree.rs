@@ -1,258 +1,22 @@
-//! Stage 8: everything into one `.volpack`.
+//! The words of the tree section, as `docs/format.md`, "The tree", has them.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::io;
-use std::path::Path;
+use std::collections::BTreeMap;
 
-use super::allocate::Allocation;
-use super::dedup::{CellRef, Payload, SequenceTree};
-use super::quantise::{GridBricks, QuantiseError, quantise};
-use super::relayout;
+use super::{GridInput, SerialiseError, too_large};
 use crate::codec::Codec;
-use crate::pack::layout::{AtlasRecord, CHUNK_BYTES, FrameRecord, GridRecord, encoding, kind};
+use crate::pack::Atlas;
 use crate::pack::tree::{
     self, GRID_WORDS, HEADER_WORDS, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS,
 };
-use crate::pack::{Atlas, PackWriter, Provenance, SectionSpec, compress_chunk};
-use crate::vdb::GridClass;
+use crate::stages::dedup::{CellRef, FrameTree, Payload, SequenceTree};
 use crate::volume::{CELL_DIM, Constant, Coord, Interner, ROOT_DIM};
 
 /// L1 nodes a frame may have room for: 4 MB of links. A box of 100 of them an axis is 400,000 voxels
 /// wide; only stray voxels far from the rest need more.
 const MAX_ROOTS: i64 = 1 << 20;
 
-/// One grid, ready to be written.
-pub struct GridInput {
-    /// Its name.
-    pub name: String,
-    /// What kind of field it holds.
-    pub class: GridClass,
-    /// Frames per second; 0 when not stated.
-    pub fps: f32,
-    /// Its frames, in the order of `tree`.
-    pub frames: Vec<FrameInput>,
-    /// Its nodes and bricks.
-    pub tree: SequenceTree,
-    /// Its codecs and ranges.
-    pub allocation: Allocation,
-}
-
-/// What the frame table says of a frame beside what its tree says.
-#[derive(Clone, Debug)]
-pub struct FrameInput {
-    /// Its number.
-    pub number: i32,
-    /// Its source's place in the provenance.
-    pub source: u32,
-    /// Index space to world space.
-    pub transform: [f64; 16],
-}
-
-/// The pack cannot be written.
-#[derive(Debug, thiserror::Error)]
-pub enum SerialiseError {
-    /// Writing failed.
-    #[error(transparent)]
-    Io(#[from] io::Error),
-    /// A value does not fit the codec.
-    #[error(transparent)]
-    Quantise(#[from] QuantiseError),
-    /// Something is larger than the format can address.
-    #[error("grid {grid:?}: {what}")]
-    TooLarge {
-        /// The grid.
-        grid: String,
-        /// What, and what to do.
-        what: String,
-    },
-}
-
-/// Writes the pack and returns its length. All grids use the codec of the first.
-///
-/// # Errors
-/// [`SerialiseError`]. Nothing is left at `path` that was not there before.
-///
-/// # Panics
-/// When there is no grid.
-pub fn serialise(
-    path: &Path,
-    grids: &mut [GridInput],
-    provenance: &Provenance,
-    zstd_level: Option<i32>,
-    mut progress: impl FnMut(u64),
-) -> Result<u64, SerialiseError> {
-    let codec = grids[0].allocation.codec;
-    let bricks: u64 = grids.iter().map(|g| u64::from(g.tree.pool.len())).sum();
-    if bricks >= L3Record::MAX_SLOTS.into() {
-        return Err(too_large(
-            &grids[0].name,
-            format!("{bricks} distinct bricks, a pack holds 2^27: use fewer frames"),
-        ));
-    }
-    let atlas = relayout::plan(codec, bricks as u32);
-    let boxes = grids.iter().map(CellBox::around).collect::<Result<Vec<_>, _>>()?;
-    let first_slots: Vec<u32> =
-        grids.iter().scan(0, |next, g| Some(std::mem::replace(next, *next + g.tree.pool.len()))).collect();
-    let mut words = TreeWords::build(grids, &boxes, &atlas, &first_slots);
-
-    let plain = if zstd_level.is_some() { encoding::ZSTD } else { encoding::RAW };
-    let texel_encoding = match (codec, zstd_level) {
-        (_, None) => encoding::RAW,
-        (Codec::F16, _) => encoding::ZSTD_SHUFFLE_2,
-        (Codec::F32, _) => encoding::ZSTD_SHUFFLE_4,
-        _ => encoding::ZSTD,
-    };
-    let level = zstd_level.unwrap_or(0);
-
-    let names: String = grids.iter().map(|g| g.name.as_str()).collect();
-    let slabs: Vec<Vec<Vec<u32>>> =
-        grids.iter().zip(&first_slots).map(|(g, &s)| frame_slabs(g, &atlas, s)).collect();
-    let list_len: usize = slabs.iter().flatten().map(Vec::len).sum();
-    let frame_count: usize = grids.iter().map(|g| g.frames.len()).sum();
-    let provenance = serde_json::to_vec_pretty(provenance).map_err(io::Error::from)?;
-
-    let spec = |kind, encoding, raw_bytes: usize| SectionSpec {
-        kind,
-        codec: 0,
-        encoding,
-        chunk_bytes: CHUNK_BYTES,
-        raw_bytes: raw_bytes as u64,
-    };
-    let mut specs = vec![
-        spec(kind::GRIDS, encoding::RAW, grids.len() * size_of::<GridRecord>()),
-        spec(kind::FRAMES, plain, frame_count * size_of::<FrameRecord>()),
-        spec(kind::NAMES, encoding::RAW, names.len()),
-        spec(kind::ATLASES, encoding::RAW, if atlas.bricks > 0 { size_of::<AtlasRecord>() } else { 0 }),
-        spec(kind::FRAME_CHUNKS, plain, list_len * 4),
-        spec(kind::PROVENANCE, plain, provenance.len()),
-    ];
-    let chunks_before: u64 = specs.iter().map(|s| s.raw_bytes.div_ceil(s.chunk_bytes.into())).sum();
-    if atlas.bricks > 0 {
-        specs.push(SectionSpec {
-            kind: kind::TEXELS,
-            codec: codec as u32,
-            encoding: texel_encoding,
-            chunk_bytes: atlas.slab_bytes() as u32,
-            raw_bytes: atlas.bytes(),
-        });
-    }
-    // The tree comes last: its records hold the packing axes, which encoding chooses.
-    specs.push(spec(kind::TREE, plain, words.words.len() * 4));
-
-    let (frames, lists) = frame_tables(grids, &slabs, chunks_before as u32);
-    let mut writer = PackWriter::create(path, specs)?;
-    writer.section(bytemuck::cast_slice(&grid_records(grids)), level)?;
-    writer.section(bytemuck::cast_slice(&frames), level)?;
-    writer.section(names.as_bytes(), level)?;
-    if atlas.bricks > 0 {
-        writer.section(bytemuck::bytes_of(&atlas_record(&atlas)), level)?;
-    } else {
-        writer.section(&[], level)?;
-    }
-    writer.section(bytemuck::cast_slice(&lists), level)?;
-    writer.section(&provenance, level)?;
-
-    if atlas.bricks > 0 {
-        writer.begin()?;
-        let mut sources: Vec<GridBricks> = grids
-            .iter_mut()
-            .zip(&first_slots)
-            .map(|(g, &first_slot)| GridBricks { tree: &mut g.tree, allocation: &g.allocation, first_slot })
-            .collect();
-        let axes = quantise(
-            &atlas,
-            &mut sources,
-            |slab| compress_chunk(slab, texel_encoding, level),
-            |chunk| {
-                progress(atlas.slab_bricks().into());
-                writer.chunk(&chunk)
-            },
-        )?;
-        words.set_axes(grids, &axes);
-    }
-    writer.section(bytemuck::cast_slice(&words.words), level)?;
-    Ok(writer.finish()?)
-}
-
-fn too_large(grid: &str, what: String) -> SerialiseError {
-    SerialiseError::TooLarge { grid: grid.to_owned(), what }
-}
-
-fn atlas_record(atlas: &Atlas) -> AtlasRecord {
-    let Atlas { codec, bricks, columns, rows, slabs, page_slabs } = *atlas;
-    AtlasRecord { codec: codec as u32, bricks, columns, rows, slabs, page_slabs }
-}
-
-fn grid_records(grids: &[GridInput]) -> Vec<GridRecord> {
-    let (mut name_offset, mut first_frame) = (0, 0);
-    grids
-        .iter()
-        .map(|g| {
-            let active = g.tree.active_range();
-            let record = GridRecord {
-                name_offset,
-                name_bytes: g.name.len() as u32,
-                class: g.class as u32,
-                first_frame,
-                frames: g.frames.len() as u32,
-                fps: g.fps,
-                active_min: active.map_or(0.0, |r| r.min),
-                active_max: active.map_or(0.0, |r| r.max),
-            };
-            name_offset += record.name_bytes;
-            first_frame += record.frames;
-            record
-        })
-        .collect()
-}
-
-/// The slabs that each frame's bricks lie in, ascending.
-fn frame_slabs(grid: &GridInput, atlas: &Atlas, first_slot: u32) -> Vec<Vec<u32>> {
-    let tree = &grid.tree;
-    let frame = |frame: &super::dedup::FrameTree| {
-        let nodes = frame.cells.iter().filter_map(|(_, content)| match content {
-            CellRef::Node(node) => Some(&tree.nodes.items()[*node as usize]),
-            CellRef::Constant(_) => None,
-        });
-        let records = nodes.flat_map(|node| node.entries(&tree.runs)).map(|&r| &tree.records[r as usize]);
-        let slabs = records.filter_map(|record| match record.payload {
-            Payload::Brick(id) => Some((first_slot + id) / atlas.slab_bricks()),
-            Payload::Constant(_) => None,
-        });
-        slabs.collect::<BTreeSet<u32>>().into_iter().collect()
-    };
-    tree.frames.iter().map(frame).collect()
-}
-
-fn frame_tables(
-    grids: &[GridInput],
-    slabs: &[Vec<Vec<u32>>],
-    first_chunk: u32,
-) -> (Vec<FrameRecord>, Vec<u32>) {
-    let mut records = Vec::new();
-    let mut lists: Vec<u32> = Vec::new();
-    for (g, (grid, slabs)) in grids.iter().zip(slabs).enumerate() {
-        for ((input, frame), slabs) in grid.frames.iter().zip(&grid.tree.frames).zip(slabs) {
-            records.push(FrameRecord {
-                grid: g as u32,
-                number: input.number,
-                source: input.source,
-                first_chunk: lists.len() as u32,
-                chunks: slabs.len() as u32,
-                bbox: frame.stats.bbox.to_array(),
-                reserved: 0,
-                leaves: frame.stats.leaves,
-                active_voxels: frame.stats.active_voxels,
-                transform: input.transform,
-            });
-            lists.extend(slabs.iter().map(|slab| first_chunk + slab));
-        }
-    }
-    (records, lists)
-}
-
 /// The part of index space that a grid's L1 nodes cover.
-struct CellBox {
+pub(super) struct CellBox {
     origin: Coord,
     /// 128³ cells of one L1 node an axis.
     cells: [u32; 3],
@@ -261,7 +25,7 @@ struct CellBox {
 }
 
 impl CellBox {
-    fn around(grid: &GridInput) -> Result<Self, SerialiseError> {
+    pub fn around(grid: &GridInput) -> Result<Self, SerialiseError> {
         let mut min = [i64::MAX; 3];
         let mut max = [i64::MIN; 3];
         let frames = || grid.tree.frames.iter();
@@ -324,13 +88,13 @@ impl CellBox {
 }
 
 /// The tree section's words, and where its records are.
-struct TreeWords {
-    words: Vec<u32>,
+pub(super) struct TreeWords {
+    pub words: Vec<u32>,
     record_at: usize,
 }
 
 impl TreeWords {
-    fn build(grids: &[GridInput], boxes: &[CellBox], atlas: &Atlas, first_slots: &[u32]) -> Self {
+    pub fn build(grids: &[GridInput], boxes: &[CellBox], atlas: &Atlas, first_slots: &[u32]) -> Self {
         let mut constants = Interner::<u32>::default();
         let grids_at = HEADER_WORDS;
         let roots_at = grids_at + grids.len() * GRID_WORDS;
@@ -411,7 +175,7 @@ impl TreeWords {
     }
 
     /// Fills in the packing axes, by grid and brick.
-    fn set_axes(&mut self, grids: &[GridInput], axes: &[Vec<u8>]) {
+    pub fn set_axes(&mut self, grids: &[GridInput], axes: &[Vec<u8>]) {
         let mut at = self.record_at;
         for (grid, axes) in grids.iter().zip(axes) {
             for &record in grid.tree.runs.items() {
@@ -444,7 +208,7 @@ fn grid_header(grid: &GridInput, bounds: &CellBox, root_at: usize) -> [u32; GRID
 
 /// The links of one frame's roots; its L1 nodes go into `l1`, whose first word is word `l1_at`.
 fn frame_roots(
-    frame: &super::dedup::FrameTree,
+    frame: &FrameTree,
     bounds: &CellBox,
     l1_at: usize,
     first_node: u32,
