@@ -15,6 +15,7 @@
 //! - [`pack`] is the file format: writer, reader, checks, decoder.
 //! - [`pipeline`] strings the stages together, [`manifest`] says with what [`settings`].
 //! - [`verify`] compares a finished pack with its source, [`report`] puts files into figures.
+//! - [`render`] traces pictures of packs and sources, on the CPU and through wgpu.
 //! - [`cli`] is the command line.
 //!
 //! To build a pack:
@@ -41,6 +42,7 @@ pub mod error;
 pub mod manifest;
 pub mod pack;
 pub mod pipeline;
+pub mod render;
 pub mod report;
 pub mod settings;
 pub mod stages;

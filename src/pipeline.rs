@@ -206,7 +206,8 @@ fn mask_policy(settings: &Settings, class: GridClass) -> MaskPolicy {
         (Masks::Keep, ..) | (Masks::Auto, Format::F32, _) | (Masks::Auto, _, GridClass::LevelSet) => {
             MaskPolicy::Keep
         }
-        _ => MaskPolicy::DropWhereBackground,
+        (Masks::Auto, ..) => MaskPolicy::DropFog,
+        (Masks::Drop, ..) => MaskPolicy::DropWhereBackground,
     }
 }
 

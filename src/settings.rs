@@ -53,7 +53,8 @@ pub enum RangeMode {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Masks {
-    /// Kept for level sets and for f32, else dropped from bricks whose inactive voxels are background
+    /// Kept for level sets, for f32 and where the background is not 0; else dropped from bricks whose
+    /// inactive voxels are background
     #[default]
     Auto,
     /// Kept everywhere

@@ -6,7 +6,7 @@ use std::collections::HashMap;
 use super::tree::{self, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS, header, l1_words};
 use super::{Frame, Grid, Pack, PackError};
 use crate::codec::{BrickRange, Codec, decode};
-use crate::volume::{BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, InactiveRule, Mask512, ROOT_DIM};
+use crate::volume::{BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, CoordBox, InactiveRule, Mask512, ROOT_DIM};
 
 /// The deepest thing that the tree has at some place.
 #[derive(Clone, Copy, Debug)]
@@ -164,6 +164,13 @@ impl FrameReader<'_> {
         let at = words[header::RECORD_AT] as usize + index as usize * RECORD_WORDS;
         let record = L3Record::from_words([words[at], words[at + 1], words[at + 2]]);
         Region::Brick(record.expect("records were checked when the pack was opened"))
+    }
+
+    /// The box of every region that is not background.
+    pub fn bounds(&self) -> CoordBox {
+        let mut bounds = CoordBox::EMPTY;
+        self.for_each_region(|origin, dim, _| bounds.union(CoordBox::cube(origin, dim)));
+        bounds
     }
 
     /// Calls `visit` with every region that is not background: its smallest corner, its side in

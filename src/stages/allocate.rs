@@ -2,9 +2,12 @@
 //!
 //! Every format here is uniform, one codec for all bricks of a grid that are not constant.
 
+use half::f16;
+
 use super::dedup::SequenceTree;
 use crate::codec::{BrickRange, Codec, SequenceRange};
 use crate::settings::{Format, RangeMode};
+use crate::volume::ValueRange;
 
 /// The codecs and ranges of one grid's bricks.
 pub struct Allocation {
@@ -28,7 +31,10 @@ pub fn allocate(tree: &SequenceTree, format: Format, mode: RangeMode) -> Option<
     let ranges = if mode == RangeMode::Sequence && codec.is_normalised() {
         vec![BrickRange::SEQUENCE; tree.brick_ranges.len()]
     } else {
-        tree.brick_ranges.iter().map(|r| sequence.fit(r.min, r.max)).collect()
+        // What bounds a voxel is what its texel decodes to.
+        let decoded = |v: f32| if codec == Codec::F16 { f16::from_f32(v).to_f32() } else { v };
+        let fit = |r: &ValueRange| sequence.fit(decoded(r.min), decoded(r.max));
+        tree.brick_ranges.iter().map(fit).collect()
     };
     Some(Allocation { codec, sequence, ranges })
 }

@@ -22,6 +22,9 @@ pub enum MaskPolicy {
     /// Not where every inactive voxel is background: the texels carry the background then, and a
     /// voxel is active where its value is something else.
     DropWhereBackground,
+    /// The same, but only where the background is 0, as it is for fog: another one is not a value that
+    /// texels give back exactly.
+    DropFog,
 }
 
 /// One grid of a sequence, with everything that repeats stored once.
@@ -141,7 +144,12 @@ struct Prepared {
 impl Prepared {
     fn new(mut brick: Brick, background: f32, policy: MaskPolicy) -> Self {
         let (rule, minus) = brick.inactive_rule(background);
-        if policy == MaskPolicy::DropWhereBackground && rule == InactiveRule::Background {
+        let drop = match policy {
+            MaskPolicy::Keep => false,
+            MaskPolicy::DropWhereBackground => true,
+            MaskPolicy::DropFog => background == 0.0,
+        };
+        if drop && rule == InactiveRule::Background {
             brick.mask = None;
         }
         let rule = if brick.mask.is_none() { InactiveRule::Texel } else { rule };

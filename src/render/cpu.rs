@@ -1,0 +1,329 @@
+//! The CPU tracer.
+//!
+//! In `f64` with [`Traversal::Dda`] it is the reference; in `f32` with [`Traversal::Hdda`] it is the
+//! shader's twin, line by line (`shaders/tracer.wgsl`).
+
+use rayon::prelude::*;
+
+use super::camera::{Camera, Lens, apply3, dot, invert3, length, normalise};
+use super::field::{Content, Field};
+use super::image::Image;
+use super::surface::{cubic, evaluate, first_change};
+use super::traverse::{Box3, Ray, Real, Walk};
+use super::{Mode, Traversal};
+use crate::volume::{Coord, CoordBox, ROOT_DIM};
+
+/// What is traced, and how it looks.
+#[derive(Clone, Copy, Debug)]
+pub struct Scene {
+    /// What a picture shows.
+    pub mode: Mode,
+    /// How rays step.
+    pub traversal: Traversal,
+    /// Where it is taken from.
+    pub camera: Camera,
+    /// Width and height in pixels.
+    pub size: [u32; 2],
+    /// Index space to world space.
+    pub matrix: [f64; 16],
+    /// Whether the grid's zero is a surface.
+    pub level_set: bool,
+    /// Optical depth of a density of 1 over a world unit.
+    pub extinction: f64,
+    /// Densities above this are a hit.
+    pub threshold: f32,
+}
+
+/// Towards the sun, in world space.
+const SUN: [f64; 3] = [0.48, 0.80, 0.36];
+/// Light that reaches shadows.
+pub const AMBIENT: f64 = 0.15;
+/// A shadow ray begins this many cells off the surface, so that the surface does not shade itself.
+const SHADOW_OFFSET: f64 = 1.5;
+/// Steps after which a ray is given up: more than any box in view has cells across.
+const MAX_STEPS: u32 = 1 << 16;
+
+/// What does not depend on the pixel, as both tracers take it. Cells are counted from `base`, so that
+/// an `f32` has as many bits for a volume far from the origin as for one around it.
+pub struct Setup {
+    /// The voxel that cell 0 is.
+    pub base: [i32; 3],
+    /// The cells to trace.
+    pub bounds: Box3,
+    /// The camera's rays.
+    pub lens: Lens,
+    /// Towards the sun, in cell space, as long as shadow rays begin off the surface.
+    pub sun: [f64; 3],
+    /// For a gradient in cell space, rows whose products are the normal in world space.
+    pub normals: [[f64; 3]; 3],
+    /// Towards the sun, in world space.
+    pub sun_world: [f64; 3],
+}
+
+impl Setup {
+    /// `voxels` is the box of everything that is not background. `None` if the scene's matrix cannot be
+    /// inverted.
+    pub fn new(scene: &Scene, voxels: CoordBox) -> Option<Self> {
+        let base = if voxels.is_empty() { [0; 3] } else { voxels.min.0 };
+        let size = |a: usize| if voxels.is_empty() { 0 } else { (voxels.max.0[a] - base[a]).saturating_add(1) };
+        let bounds = Box3 { min: [0; 3], max: std::array::from_fn(size) };
+        let bounds = if scene.level_set { bounds.grown() } else { bounds };
+        let shift = if scene.level_set { 0.0 } else { 0.5 };
+        let shift = base.map(|b| shift - f64::from(b));
+        let lens = Lens::new(&scene.camera, &scene.matrix, scene.size, shift)?;
+        // world = index · M, so gradients go by the inverse transposed: row r of it is what index
+        // axis a has of world axis r.
+        let inverse = invert3(&scene.matrix)?;
+        let sun_world = normalise(SUN);
+        let sun = apply3(&inverse, sun_world);
+        let sun = sun.map(|v| v * SHADOW_OFFSET / length(sun));
+        Some(Self { base, bounds, lens, sun, normals: inverse, sun_world })
+    }
+}
+
+/// Traces a picture: four numbers a pixel, of which the last is the steps taken.
+///
+/// `None` if the scene's matrix cannot be inverted.
+pub fn trace<F: Real>(field: &Field, scene: &Scene) -> Option<Image> {
+    let setup = Setup::new(scene, field.bounds)?;
+    let tracer = Tracer::<F> { field, scene, setup: &setup, extinction: F::from_f64(scene.extinction) };
+    let [width, height] = scene.size;
+    let pixels = (0..width * height).into_par_iter().map(|i| tracer.pixel(i % width, i / width)).collect();
+    Some(Image { size: scene.size, pixels })
+}
+
+struct Tracer<'a, F> {
+    field: &'a Field,
+    scene: &'a Scene,
+    setup: &'a Setup,
+    extinction: F,
+}
+
+/// Where a ray first hits something.
+struct Hit<F> {
+    t: F,
+    cell: [i32; 3],
+    /// World space, for surfaces.
+    normal: Option<[f64; 3]>,
+    /// The axis of the face through which the cell was entered; 3 for none.
+    axis: usize,
+    value: f32,
+}
+
+impl<F: Real> Tracer<'_, F> {
+    fn pixel(&self, x: u32, y: u32) -> [f32; 4] {
+        let [width, height] = self.scene.size;
+        let at = |i: u32, n: u32| (2.0 * f64::from(i) + 1.0) / f64::from(n) - 1.0;
+        let ray = self.setup.lens.ray::<F>(at(x, width), -at(y, height));
+        let mut steps = 0;
+        let color = if self.scene.mode == Mode::Density && !self.scene.level_set {
+            let depth = self.optical_depth(&ray, &mut steps);
+            let opacity = F::from_i32(1) - (-(depth * self.extinction)).exp();
+            [opacity.to_f64() as f32; 3]
+        } else {
+            let hit = self.first_hit(&ray, &mut steps);
+            self.shade(&ray, hit, &mut steps)
+        };
+        let steps = steps as f32;
+        if self.scene.mode == Mode::Steps { [steps; 4] } else { [color[0], color[1], color[2], steps] }
+    }
+
+    /// The voxel that a cell is, or has as its first corner.
+    fn voxel(&self, cell: [i32; 3]) -> Coord {
+        Coord(std::array::from_fn(|a| cell[a] + self.setup.base[a]))
+    }
+
+    /// The node to step over: the whole of it for HDDA where it has one value, else one cell.
+    fn node(&self, cell: [i32; 3]) -> (Box3, Option<f32>) {
+        let found = self.field.find(self.voxel(cell));
+        let constant = match found.content {
+            Content::Constant(constant) => Some(constant.value),
+            Content::Brick(..) => None,
+        };
+        match (constant, self.scene.traversal) {
+            (Some(_), Traversal::Hdda) => {
+                let min = std::array::from_fn(|a| found.origin.0[a] - self.setup.base[a]);
+                (Box3::cube(min, found.dim), constant)
+            },
+            _ => (Box3::cube(cell, 1), constant),
+        }
+    }
+
+    /// The integral of density over distance.
+    fn optical_depth(&self, ray: &Ray<F>, steps: &mut u32) -> F {
+        let mut depth = F::from_i32(0);
+        let bounds = self.setup.bounds;
+        let Some(mut walk) = Walk::enter(ray, bounds) else { return depth };
+        while bounds.contains(walk.cell) && *steps < MAX_STEPS {
+            *steps += 1;
+            let (node, constant) = self.node(walk.cell);
+            let node = node.within(bounds);
+            let value = constant.unwrap_or_else(|| self.field.value(self.voxel(walk.cell)));
+            let from = walk.t;
+            walk.leave(ray, node);
+            depth = depth + (walk.t - from) * F::from_f64(value.into());
+        }
+        depth
+    }
+
+    fn first_hit(&self, ray: &Ray<F>, steps: &mut u32) -> Option<Hit<F>> {
+        let bounds = self.setup.bounds;
+        let walk = Walk::enter(ray, bounds)?;
+        if self.scene.level_set {
+            self.first_surface(ray, bounds, walk, steps)
+        } else {
+            self.first_density(ray, bounds, walk, steps)
+        }
+    }
+
+    fn first_density(&self, ray: &Ray<F>, bounds: Box3, mut walk: Walk<F>, steps: &mut u32) -> Option<Hit<F>> {
+        while bounds.contains(walk.cell) && *steps < MAX_STEPS {
+            *steps += 1;
+            let (node, constant) = self.node(walk.cell);
+            let value = constant.unwrap_or_else(|| self.field.value(self.voxel(walk.cell)));
+            if value > self.scene.threshold {
+                return Some(Hit { t: walk.t, cell: walk.cell, normal: None, axis: walk.axis, value });
+            }
+            walk.leave(ray, node.within(bounds));
+        }
+        None
+    }
+
+    /// The first zero of the interpolated field. A cell reaches over to the next voxel on each axis, so
+    /// the last layer of a node's cells is taken one by one.
+    fn first_surface(&self, ray: &Ray<F>, bounds: Box3, mut walk: Walk<F>, steps: &mut u32) -> Option<Hit<F>> {
+        let mut negative = None;
+        while bounds.contains(walk.cell) && *steps < MAX_STEPS {
+            *steps += 1;
+            let (node, constant) = self.node(walk.cell);
+            let inner = Box3 { min: node.min, max: node.max.map(|v| v - 1) };
+            if let (Some(value), true) = (constant, inner.contains(walk.cell)) {
+                let sign = value < 0.0;
+                if negative.is_some_and(|n| n != sign) {
+                    return Some(self.surface_hit(ray, &walk, walk.t));
+                }
+                negative = Some(sign);
+                walk.leave(ray, inner.within(bounds));
+                continue;
+            }
+            let corners = self.corners(walk.cell);
+            let cell = Box3::cube(walk.cell, 1);
+            let (exit, _) = walk.exit(ray, cell);
+            let from = self.local(ray, walk.cell, walk.t);
+            let along = std::array::from_fn(|a| ray.direction[a] * (exit - walk.t));
+            let c = cubic(corners, from, along);
+            let start = *negative.get_or_insert(evaluate(c, F::from_i32(0)) < F::from_i32(0));
+            if corners.iter().any(|v| (*v < F::from_i32(0)) != start)
+                && let Some(u) = first_change(c, start)
+            {
+                return Some(self.surface_hit(ray, &walk, walk.t + (exit - walk.t) * u));
+            }
+            walk.leave(ray, cell);
+        }
+        None
+    }
+
+    /// A place on the ray relative to a cell.
+    fn local(&self, ray: &Ray<F>, cell: [i32; 3], t: F) -> [F; 3] {
+        std::array::from_fn(|a| ray.origin[a] - F::from_i32(cell[a]) + ray.direction[a] * t)
+    }
+
+    /// The voxels at a cell's corners, ordered by x + 2y + 4z.
+    fn corners(&self, cell: [i32; 3]) -> [F; 8] {
+        std::array::from_fn(|i| {
+            let corner = std::array::from_fn(|a| cell[a] + (i >> a & 1) as i32);
+            F::from_f64(self.field.value(self.voxel(corner)).into())
+        })
+    }
+
+    fn surface_hit(&self, ray: &Ray<F>, walk: &Walk<F>, t: F) -> Hit<F> {
+        let c = self.corners(walk.cell).map(Real::to_f64);
+        let p = self.local(ray, walk.cell, t).map(|v| v.to_f64().clamp(0.0, 1.0));
+        let gradient: [f64; 3] = std::array::from_fn(|a| {
+            (0..8)
+                .filter(|i| i >> a & 1 == 0)
+                .map(|i: usize| {
+                    let side = |b: usize| if i >> b & 1 == 1 { p[b] } else { 1.0 - p[b] };
+                    let weight: f64 = (0..3).filter(|&b| b != a).map(side).product();
+                    weight * (c[i | 1 << a] - c[i])
+                })
+                .sum()
+        });
+        let world = std::array::from_fn(|r| (0..3).map(|a| self.setup.normals[r][a] * gradient[a]).sum());
+        Hit { t, cell: walk.cell, normal: Some(normalise(world)), axis: walk.axis, value: 1.0 }
+    }
+
+    fn shade(&self, ray: &Ray<F>, hit: Option<Hit<F>>, steps: &mut u32) -> [f32; 3] {
+        let Some(hit) = hit else {
+            return if self.scene.mode == Mode::Depth { [-1.0; 3] } else { [0.0; 3] };
+        };
+        match self.scene.mode {
+            Mode::Depth => [hit.t.to_f64() as f32; 3],
+            Mode::First => [hit.value; 3],
+            Mode::Bricks => brick_hue(self.voxel(hit.cell).0),
+            Mode::Nodes => self.node_color(ray, &hit),
+            Mode::Normals => self.normal(ray, &hit).map(|n| (n * 0.5 + 0.5) as f32),
+            Mode::Density | Mode::Lit => [self.lit(ray, &hit, steps) as f32; 3],
+            Mode::Steps => [0.0; 3],
+        }
+    }
+
+    /// A surface's own normal; else that of the face, in cell space.
+    fn normal(&self, ray: &Ray<F>, hit: &Hit<F>) -> [f64; 3] {
+        hit.normal.unwrap_or_else(|| {
+            let mut n = [0.0; 3];
+            if hit.axis < 3 {
+                n[hit.axis] = if ray.direction[hit.axis] > F::from_i32(0) { -1.0 } else { 1.0 };
+            }
+            n
+        })
+    }
+
+    fn lit(&self, ray: &Ray<F>, hit: &Hit<F>, steps: &mut u32) -> f64 {
+        let normal = self.normal(ray, hit);
+        let facing = dot(normal, self.setup.sun_world);
+        if facing <= 0.0 {
+            return AMBIENT;
+        }
+        let sun = self.setup.sun.map(F::from_f64);
+        let origin = std::array::from_fn(|a| ray.origin[a] + ray.direction[a] * hit.t + sun[a]);
+        let shadow = Ray::new(origin, sun);
+        if self.first_hit(&shadow, steps).is_some() { AMBIENT } else { AMBIENT + (1.0 - AMBIENT) * facing }
+    }
+
+    /// Blue, red or cyan near a boundary of an L1, L2 or L3 node on the face that was hit; else grey.
+    fn node_color(&self, ray: &Ray<F>, hit: &Hit<F>) -> [f32; 3] {
+        // Nodes lie on multiples of their side counted from voxel 0.
+        let zero = self.setup.base.map(|b| -(b & (ROOT_DIM - 1)));
+        let p = self.local(ray, zero, hit.t);
+        for (dim, width, color) in NODE_COLORS {
+            let near = (0..3).filter(|&a| a != hit.axis).any(|a| {
+                let place = p[a] / F::from_i32(dim);
+                let nearest = (place + F::from_f64(0.5)).floor_i32();
+                let off = (place - F::from_i32(nearest)) * F::from_i32(dim);
+                let width = F::from_f64(width);
+                off < width && -off < width
+            });
+            if near {
+                return color;
+            }
+        }
+        [0.25; 3]
+    }
+}
+
+/// Side, half width of the line in cells, and colour of what is drawn around nodes.
+const NODE_COLORS: [(i32, f64, [f32; 3]); 3] = [
+    (ROOT_DIM, 1.0, [0.1, 0.2, 1.0]),
+    (128, 0.75, [1.0, 0.15, 0.1]),
+    (8, 0.5, [0.0, 0.9, 0.9]),
+];
+
+/// A hue that differs between neighbouring bricks: the same bits in the shader.
+fn brick_hue(cell: [i32; 3]) -> [f32; 3] {
+    let [x, y, z] = cell.map(|c| (c >> 3) as u32);
+    let mut h = x.wrapping_mul(0x8da6_b343) ^ y.wrapping_mul(0xd816_3841) ^ z.wrapping_mul(0xcb1a_b31f);
+    h = (h ^ (h >> 13)).wrapping_mul(0x85eb_ca6b);
+    h ^= h >> 16;
+    [h & 255, h >> 8 & 255, h >> 16 & 255].map(|c| 0.2 + 0.8 * c as f32 / 255.0)
+}

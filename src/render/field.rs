@@ -1,0 +1,170 @@
+//! One frame's voxels, quick to look up by coordinate: what the CPU tracer traces.
+
+use std::collections::HashMap;
+
+use crate::codec::Codec;
+use crate::pack::{FrameReader, PackError, Region};
+use crate::volume::{
+    BRICK_DIM, BRICK_VOXELS, CELL_DIM, CellContent, Child, Constant, Coord, CoordBox, FlatFrame, Mask512, ROOT_DIM,
+};
+
+/// A frame as nested constants and bricks of values.
+pub struct Field {
+    /// The value outside everything.
+    pub background: f32,
+    /// The box of everything that is not background, in whole bricks; empty if there is nothing.
+    pub bounds: CoordBox,
+    roots: HashMap<Coord, Constant>,
+    cells: HashMap<Coord, Cell>,
+    bricks: Vec<(Box<[f32; BRICK_VOXELS]>, Mask512)>,
+}
+
+enum Cell {
+    Constant(Constant),
+    /// For each of 4096 places what is there; 0 is background.
+    Node(Box<[u32; 4096]>, Vec<Constant>),
+}
+
+/// Marks a place's number as that of a constant.
+const CONSTANT: u32 = 1 << 31;
+
+/// The node around a voxel.
+#[derive(Clone, Copy)]
+pub struct Found<'a> {
+    /// What it holds.
+    pub content: Content<'a>,
+    /// Its smallest corner.
+    pub origin: Coord,
+    /// Its side.
+    pub dim: i32,
+}
+
+/// What a node holds.
+#[derive(Clone, Copy)]
+pub enum Content<'a> {
+    /// One value.
+    Constant(Constant),
+    /// 512 voxels.
+    Brick(&'a [f32; BRICK_VOXELS], &'a Mask512),
+}
+
+impl Field {
+    fn empty(background: f32) -> Self {
+        Self { background, bounds: CoordBox::EMPTY, roots: HashMap::new(), cells: HashMap::new(), bricks: Vec::new() }
+    }
+
+    /// A frame of the source.
+    pub fn from_flat(frame: FlatFrame, background: f32) -> Self {
+        let mut field = Self::empty(background);
+        for (origin, constant) in frame.roots {
+            field.put_root(origin, constant);
+        }
+        let mut bricks: Vec<Option<_>> = frame.bricks.into_iter().map(Some).collect();
+        for cell in frame.cells {
+            match cell.content {
+                CellContent::Constant(constant) => field.put_cell(cell.origin, constant),
+                CellContent::Node(children) => {
+                    for (place, child) in children {
+                        let origin = cell.origin.offset_by(Coord::child_offset(place.into(), 4, BRICK_DIM));
+                        match child {
+                            Child::Constant(constant) => field.put_region(origin, constant),
+                            Child::Brick(i) => {
+                                let brick = bricks[i as usize].take().expect("each brick is named once");
+                                let mask = brick.mask.expect("bricks of the source have their masks");
+                                field.put_brick(origin, Box::new(brick.values), mask);
+                            }
+                        }
+                    }
+                }
+            }
+        }
+        field
+    }
+
+    /// A frame of a pack, decoded.
+    ///
+    /// # Errors
+    /// When a texel chunk is damaged.
+    pub fn from_pack(frame: &FrameReader) -> Result<Self, PackError> {
+        let mut field = Self::empty(frame.grid().background);
+        let mut result = Ok(());
+        frame.for_each_region(|origin, dim, region| match region {
+            Region::Background => {}
+            Region::Constant(constant) if dim == ROOT_DIM => field.put_root(origin, constant),
+            Region::Constant(constant) => field.put_cell(origin, constant),
+            Region::Brick(record) if record.codec == Codec::Constant && record.mask.is_none() => {
+                let value = f32::from_bits(record.word2);
+                field.put_region(origin, Constant { value, active: value != field.background });
+            }
+            Region::Brick(record) => match frame.decode(&record) {
+                Ok(brick) => field.put_brick(origin, brick.values, brick.active),
+                Err(e) => result = Err(e),
+            },
+        });
+        result.map(|()| field)
+    }
+
+    fn put_root(&mut self, origin: Coord, constant: Constant) {
+        self.bounds.union(CoordBox::cube(origin, ROOT_DIM));
+        self.roots.insert(origin, constant);
+    }
+
+    fn put_cell(&mut self, origin: Coord, constant: Constant) {
+        self.bounds.union(CoordBox::cube(origin, CELL_DIM));
+        self.cells.insert(origin, Cell::Constant(constant));
+    }
+
+    fn place(&mut self, origin: Coord) -> (&mut u32, &mut Vec<Constant>) {
+        self.bounds.union(CoordBox::cube(origin, BRICK_DIM));
+        let cell = self
+            .cells
+            .entry(origin.align_down(CELL_DIM))
+            .or_insert_with(|| Cell::Node(Box::new([0; 4096]), Vec::new()));
+        let Cell::Node(places, constants) = cell else { unreachable!("a cell is constant or a node") };
+        (&mut places[origin.child_index(4, BRICK_DIM)], constants)
+    }
+
+    fn put_region(&mut self, origin: Coord, constant: Constant) {
+        let (place, constants) = self.place(origin);
+        *place = CONSTANT | constants.len() as u32;
+        constants.push(constant);
+    }
+
+    fn put_brick(&mut self, origin: Coord, values: Box<[f32; BRICK_VOXELS]>, mask: Mask512) {
+        let number = self.bricks.len() as u32 + 1;
+        *self.place(origin).0 = number;
+        self.bricks.push((values, mask));
+    }
+
+    /// The node around a voxel.
+    pub fn find(&self, at: Coord) -> Found<'_> {
+        let found = |content, dim: i32| Found { content, origin: at.align_down(dim), dim };
+        let background = Content::Constant(Constant { value: self.background, active: false });
+        match self.cells.get(&at.align_down(CELL_DIM)) {
+            None => match self.roots.get(&at.align_down(ROOT_DIM)) {
+                Some(root) => found(Content::Constant(*root), ROOT_DIM),
+                None => found(background, CELL_DIM),
+            },
+            Some(Cell::Constant(c)) => found(Content::Constant(*c), CELL_DIM),
+            Some(Cell::Node(places, constants)) => {
+                let content = match places[at.child_index(4, BRICK_DIM)] {
+                    0 => background,
+                    c if c & CONSTANT != 0 => Content::Constant(constants[(c & !CONSTANT) as usize]),
+                    brick => {
+                        let (values, mask) = &self.bricks[brick as usize - 1];
+                        Content::Brick(values, mask)
+                    }
+                };
+                found(content, BRICK_DIM)
+            }
+        }
+    }
+
+    /// One voxel's value.
+    pub fn value(&self, at: Coord) -> f32 {
+        match self.find(at).content {
+            Content::Constant(constant) => constant.value,
+            Content::Brick(values, _) => values[at.child_index(3, 1)],
+        }
+    }
+}

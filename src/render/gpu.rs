@@ -1,0 +1,442 @@
+//! The wgpu tracer: a pack's sections uploaded as they lie in the file, and `shaders/` run on them.
+
+use bytemuck::{Pod, Zeroable};
+use wgpu::util::DeviceExt;
+
+use super::cpu::{AMBIENT, Scene, Setup};
+use super::image::Image;
+use super::{Mode, Traversal};
+use crate::codec::Codec;
+use crate::pack::{Atlas, Pack, PackError};
+use crate::volume::CoordBox;
+
+/// `volpack.wgsl`, what an engine takes over.
+pub const VOLPACK_WGSL: &str = include_str!("shaders/volpack.wgsl");
+/// `tracer.wgsl`, which goes with it.
+pub const TRACER_WGSL: &str = include_str!("shaders/tracer.wgsl");
+
+/// Why a GPU cannot trace a pack.
+#[derive(Debug, thiserror::Error)]
+pub enum GpuError {
+    /// No Vulkan, Metal or Direct3D 12 answers.
+    #[error("no GPU or software Vulkan answers: {0}")]
+    NoAdapter(String),
+    /// The adapter lacks something.
+    #[error("{adapter} {what}")]
+    Lacks {
+        /// Its name.
+        adapter: String,
+        /// What it lacks.
+        what: String,
+    },
+    /// The device failed.
+    #[error("the GPU failed: {0}")]
+    Failed(String),
+    /// The pack is damaged.
+    #[error(transparent)]
+    Pack(#[from] PackError),
+    /// The scene's matrix cannot be inverted.
+    #[error("the grid's transform cannot be inverted")]
+    Transform,
+}
+
+/// A device that can trace.
+pub struct Gpu {
+    /// The adapter's name.
+    pub name: String,
+    /// Whether it is a CPU that runs shaders.
+    pub is_software: bool,
+    device: wgpu::Device,
+    queue: wgpu::Queue,
+    pipeline: wgpu::ComputePipeline,
+    timestamps: bool,
+}
+
+/// A pack on a GPU.
+pub struct Uploaded {
+    tree: wgpu::Buffer,
+    textures: [wgpu::TextureView; 5],
+    bytes: u64,
+}
+
+#[derive(Clone, Copy, Pod, Zeroable)]
+#[repr(C)]
+struct Params {
+    origin: [f32; 3],
+    mode: u32,
+    forward: [f32; 3],
+    traversal: u32,
+    right: [f32; 3],
+    half_width: f32,
+    up: [f32; 3],
+    half_height: f32,
+    base: [i32; 3],
+    grid: u32,
+    low: [i32; 3],
+    frame: u32,
+    high: [i32; 3],
+    level_set: u32,
+    sun: [f32; 3],
+    extinction: f32,
+    sun_world: [f32; 3],
+    threshold: f32,
+    normal_x: [f32; 3],
+    width: u32,
+    normal_y: [f32; 3],
+    height: u32,
+    normal_z: [f32; 3],
+    ambient: f32,
+}
+
+impl Gpu {
+    /// Opens the best adapter.
+    ///
+    /// # Errors
+    /// [`GpuError::NoAdapter`] where there is none, [`GpuError::Lacks`] where it cannot hold packs.
+    pub fn open() -> Result<Self, GpuError> {
+        // Vulkan, Metal and Direct3D 12 only: the GL backend decodes 3-D BC4 wrong.
+        let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
+            backends: wgpu::Backends::VULKAN | wgpu::Backends::METAL | wgpu::Backends::DX12,
+            ..wgpu::InstanceDescriptor::new_without_display_handle()
+        });
+        let options = wgpu::RequestAdapterOptions {
+            power_preference: wgpu::PowerPreference::HighPerformance,
+            ..Default::default()
+        };
+        let adapter = pollster::block_on(instance.request_adapter(&options))
+            .map_err(|e| GpuError::NoAdapter(e.to_string()))?;
+        let info = adapter.get_info();
+        let lacks = |what: &str| GpuError::Lacks { adapter: info.name.clone(), what: what.to_owned() };
+        let blocks = wgpu::Features::TEXTURE_COMPRESSION_BC | wgpu::Features::TEXTURE_COMPRESSION_BC_SLICED_3D;
+        if !adapter.features().contains(blocks) {
+            return Err(lacks("has no block-compressed 3-D textures"));
+        }
+        let timestamps = adapter.features().contains(wgpu::Features::TIMESTAMP_QUERY);
+        let timing = if timestamps { wgpu::Features::TIMESTAMP_QUERY } else { wgpu::Features::empty() };
+        let (device, queue) = pollster::block_on(adapter.request_device(&wgpu::DeviceDescriptor {
+            label: Some("volpack"),
+            required_features: blocks | timing,
+            required_limits: adapter.limits(),
+            ..Default::default()
+        }))
+        .map_err(|e| GpuError::Failed(e.to_string()))?;
+        let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
+            label: Some("volpack + tracer"),
+            source: wgpu::ShaderSource::Wgsl(format!("{VOLPACK_WGSL}\n{TRACER_WGSL}").into()),
+        });
+        let pipeline = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+            label: Some("tracer"),
+            layout: Some(&Self::layout(&device)),
+            module: &module,
+            entry_point: Some("main"),
+            compilation_options: wgpu::PipelineCompilationOptions::default(),
+            cache: None,
+        });
+        let is_software = info.device_type == wgpu::DeviceType::Cpu;
+        Ok(Self { name: info.name, is_software, device, queue, pipeline, timestamps })
+    }
+
+    fn layout(device: &wgpu::Device) -> wgpu::PipelineLayout {
+        let entry = |binding, ty| wgpu::BindGroupLayoutEntry {
+            binding,
+            visibility: wgpu::ShaderStages::COMPUTE,
+            ty,
+            count: None,
+        };
+        let buffer = |ty| wgpu::BindingType::Buffer { ty, has_dynamic_offset: false, min_binding_size: None };
+        let texture = wgpu::BindingType::Texture {
+            sample_type: wgpu::TextureSampleType::Float { filterable: false },
+            view_dimension: wgpu::TextureViewDimension::D3,
+            multisampled: false,
+        };
+        let mut entries = vec![
+            entry(0, buffer(wgpu::BufferBindingType::Uniform)),
+            entry(1, buffer(wgpu::BufferBindingType::Storage { read_only: true })),
+            entry(2, buffer(wgpu::BufferBindingType::Storage { read_only: false })),
+        ];
+        entries.extend((3..8).map(|binding| entry(binding, texture)));
+        let group =
+            device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: None, entries: &entries });
+        device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+            bind_group_layouts: &[Some(&group)],
+            ..Default::default()
+        })
+    }
+
+    /// Uploads a pack's tree and texture pages.
+    ///
+    /// # Errors
+    /// [`GpuError::Lacks`] past one of the adapter's limits, which it names.
+    pub fn upload(&self, pack: &Pack) -> Result<Uploaded, GpuError> {
+        let lacks = |what: String| GpuError::Lacks { adapter: self.name.clone(), what };
+        let limits = self.device.limits();
+        let tree_bytes = pack.tree.len() as u64 * 4;
+        let most = u64::from(limits.max_storage_buffer_binding_size).min(limits.max_buffer_size);
+        if tree_bytes > most {
+            return Err(lacks(format!("binds storage of {most} bytes, the pack's tree has {tree_bytes}")));
+        }
+        let tree = self.device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
+            label: Some("tree"),
+            contents: bytemuck::cast_slice(&pack.tree),
+            usage: wgpu::BufferUsages::STORAGE,
+        });
+        let mut bytes = tree_bytes;
+        let mut views = Vec::new();
+        for codec in Codec::WITH_TEXELS {
+            views.push(match pack.atlas(codec) {
+                None => self.texture(wgpu::TextureFormat::R8Unorm, [1; 3]).create_view(&Default::default()),
+                Some(atlas) => {
+                    if atlas.slabs > atlas.page_slabs {
+                        let pages = atlas.slabs.div_ceil(atlas.page_slabs);
+                        return Err(lacks(format!(
+                            "is given one texture page a codec by this tracer, {} has {pages}",
+                            codec.name()
+                        )));
+                    }
+                    let size = page_size(atlas);
+                    if size.iter().any(|s| *s > limits.max_texture_dimension_3d) {
+                        let most = limits.max_texture_dimension_3d;
+                        return Err(lacks(format!("has 3-D textures of {most} texels an axis, a page is {size:?}")));
+                    }
+                    bytes += atlas.bytes();
+                    self.upload_page(pack, atlas, size)?
+                }
+            });
+        }
+        let textures = views.try_into().expect("five codecs have texels");
+        Ok(Uploaded { tree, textures, bytes })
+    }
+
+    fn texture(&self, format: wgpu::TextureFormat, size: [u32; 3]) -> wgpu::Texture {
+        self.device.create_texture(&wgpu::TextureDescriptor {
+            label: None,
+            size: wgpu::Extent3d { width: size[0], height: size[1], depth_or_array_layers: size[2] },
+            mip_level_count: 1,
+            sample_count: 1,
+            dimension: wgpu::TextureDimension::D3,
+            format,
+            usage: wgpu::TextureUsages::TEXTURE_BINDING | wgpu::TextureUsages::COPY_DST,
+            view_formats: &[],
+        })
+    }
+
+    /// One copy a slab, each a range of the page's slices.
+    fn upload_page(&self, pack: &Pack, atlas: &Atlas, size: [u32; 3]) -> Result<wgpu::TextureView, GpuError> {
+        let layout = atlas.codec.layout();
+        let slices = layout.slices as u32;
+        let texture = self.texture(texture_format(atlas.codec), size);
+        for slab in 0..atlas.slabs {
+            self.queue.write_texture(
+                wgpu::TexelCopyTextureInfo {
+                    texture: &texture,
+                    mip_level: 0,
+                    origin: wgpu::Origin3d { x: 0, y: 0, z: slab * slices },
+                    aspect: wgpu::TextureAspect::All,
+                },
+                &pack.slab(atlas.codec, slab)?,
+                wgpu::TexelCopyBufferLayout {
+                    offset: 0,
+                    bytes_per_row: Some(atlas.columns * layout.row_bytes as u32),
+                    rows_per_image: Some(atlas.rows * layout.rows as u32),
+                },
+                wgpu::Extent3d { width: size[0], height: size[1], depth_or_array_layers: slices },
+            );
+        }
+        Ok(texture.create_view(&Default::default()))
+    }
+
+    /// Traces a frame of a grid. `voxels` is the box of what is not background in it.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn trace(
+        &self,
+        uploaded: &Uploaded,
+        [grid, frame]: [u32; 2],
+        voxels: CoordBox,
+        scene: &Scene,
+    ) -> Result<Image, GpuError> {
+        Ok(self.trace_timed(uploaded, [grid, frame], voxels, scene, 1)?.0)
+    }
+
+    /// The same, `repeats` times, with the milliseconds of each pass where the adapter counts time.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn trace_timed(
+        &self,
+        uploaded: &Uploaded,
+        [grid, frame]: [u32; 2],
+        voxels: CoordBox,
+        scene: &Scene,
+        repeats: u32,
+    ) -> Result<(Image, Vec<f64>), GpuError> {
+        let [width, height] = scene.size;
+        let bytes = u64::from(width) * u64::from(height) * 16;
+        if bytes > u64::from(self.device.limits().max_storage_buffer_binding_size) {
+            return Err(GpuError::Lacks {
+                adapter: self.name.clone(),
+                what: format!("cannot write a picture of {width} × {height}"),
+            });
+        }
+        let params = self.device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
+            label: Some("params"),
+            contents: bytemuck::bytes_of(&params(scene, grid, frame, voxels).ok_or(GpuError::Transform)?),
+            usage: wgpu::BufferUsages::UNIFORM,
+        });
+        let buffer = |size, usage| {
+            self.device.create_buffer(&wgpu::BufferDescriptor { label: None, size, usage, mapped_at_creation: false })
+        };
+        let output = buffer(bytes, wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC);
+        let readback = buffer(bytes, wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST);
+        let group = self.bind(uploaded, &params, &output);
+
+        let mut milliseconds = Vec::new();
+        for _ in 0..repeats {
+            let mut encoder = self.device.create_command_encoder(&Default::default());
+            let queries = self.timestamps.then(|| Queries::new(&self.device));
+            {
+                let mut pass = encoder.begin_compute_pass(&wgpu::ComputePassDescriptor {
+                    label: Some("trace"),
+                    timestamp_writes: queries.as_ref().map(|q| wgpu::ComputePassTimestampWrites {
+                        query_set: &q.set,
+                        beginning_of_pass_write_index: Some(0),
+                        end_of_pass_write_index: Some(1),
+                    }),
+                });
+                pass.set_pipeline(&self.pipeline);
+                pass.set_bind_group(0, &group, &[]);
+                pass.dispatch_workgroups(width.div_ceil(8), height.div_ceil(8), 1);
+            }
+            if let Some(q) = &queries {
+                encoder.resolve_query_set(&q.set, 0..2, &q.resolved, 0);
+                encoder.copy_buffer_to_buffer(&q.resolved, 0, &q.readback, 0, 16);
+            }
+            encoder.copy_buffer_to_buffer(&output, 0, &readback, 0, bytes);
+            self.queue.submit([encoder.finish()]);
+            if let Some(q) = &queries {
+                let ticks: Vec<u64> = self.read(&q.readback)?;
+                let nanoseconds = (ticks[1] - ticks[0]) as f64 * f64::from(self.queue.get_timestamp_period());
+                milliseconds.push(nanoseconds / 1e6);
+            }
+        }
+        Ok((Image { size: scene.size, pixels: self.read(&readback)? }, milliseconds))
+    }
+
+    fn bind(&self, uploaded: &Uploaded, params: &wgpu::Buffer, output: &wgpu::Buffer) -> wgpu::BindGroup {
+        let buffers = [params, &uploaded.tree, output].map(wgpu::Buffer::as_entire_binding);
+        let textures = uploaded.textures.iter().map(wgpu::BindingResource::TextureView);
+        let entries: Vec<_> = buffers
+            .into_iter()
+            .chain(textures)
+            .zip(0..)
+            .map(|(resource, binding)| wgpu::BindGroupEntry { binding, resource })
+            .collect();
+        self.device.create_bind_group(&wgpu::BindGroupDescriptor {
+            label: None,
+            layout: &self.pipeline.get_bind_group_layout(0),
+            entries: &entries,
+        })
+    }
+
+    /// Waits for the device and reads a buffer.
+    fn read<T: Pod>(&self, buffer: &wgpu::Buffer) -> Result<Vec<T>, GpuError> {
+        let (sender, receiver) = std::sync::mpsc::channel();
+        buffer.slice(..).map_async(wgpu::MapMode::Read, move |result| {
+            // The receiver is gone only when waiting failed, which is what is reported then.
+            let _ = sender.send(result);
+        });
+        let failed = |e: &dyn std::fmt::Display| GpuError::Failed(e.to_string());
+        self.device.poll(wgpu::PollType::wait_indefinitely()).map_err(|e| failed(&e))?;
+        receiver.recv().map_err(|e| failed(&e))?.map_err(|e| failed(&e))?;
+        let view = buffer.slice(..).get_mapped_range().map_err(|e| failed(&e))?;
+        let values = bytemuck::allocation::pod_collect_to_vec(&view);
+        drop(view);
+        buffer.unmap();
+        Ok(values)
+    }
+}
+
+impl Uploaded {
+    /// Bytes of tree and pages.
+    pub fn bytes(&self) -> u64 {
+        self.bytes
+    }
+}
+
+struct Queries {
+    set: wgpu::QuerySet,
+    resolved: wgpu::Buffer,
+    readback: wgpu::Buffer,
+}
+
+impl Queries {
+    fn new(device: &wgpu::Device) -> Self {
+        let buffer = |usage| {
+            device.create_buffer(&wgpu::BufferDescriptor { label: None, size: 16, usage, mapped_at_creation: false })
+        };
+        Self {
+            set: device.create_query_set(&wgpu::QuerySetDescriptor {
+                label: None,
+                ty: wgpu::QueryType::Timestamp,
+                count: 2,
+            }),
+            resolved: buffer(wgpu::BufferUsages::QUERY_RESOLVE | wgpu::BufferUsages::COPY_SRC),
+            readback: buffer(wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST),
+        }
+    }
+}
+
+fn texture_format(codec: Codec) -> wgpu::TextureFormat {
+    match codec {
+        Codec::Bc7 => wgpu::TextureFormat::Bc7RgbaUnorm,
+        Codec::Bc4 => wgpu::TextureFormat::Bc4RUnorm,
+        Codec::F16 => wgpu::TextureFormat::R16Float,
+        Codec::F32 => wgpu::TextureFormat::R32Float,
+        Codec::Unorm8 | Codec::Constant => wgpu::TextureFormat::R8Unorm,
+    }
+}
+
+/// Texels of the first page.
+fn page_size(atlas: &Atlas) -> [u32; 3] {
+    let slabs = atlas.slabs.min(atlas.page_slabs);
+    [atlas.columns * 8, atlas.rows * 8, slabs * atlas.codec.layout().slices as u32]
+}
+
+fn params(scene: &Scene, grid: u32, frame: u32, voxels: CoordBox) -> Option<Params> {
+    let setup = Setup::new(scene, voxels)?;
+    let f = |v: [f64; 3]| v.map(|v| v as f32);
+    Some(Params {
+        origin: f(setup.lens.origin),
+        mode: scene.mode as u32,
+        forward: f(setup.lens.forward),
+        traversal: u32::from(scene.traversal == Traversal::Hdda),
+        right: f(setup.lens.right),
+        half_width: setup.lens.half_width as f32,
+        up: f(setup.lens.up),
+        half_height: setup.lens.half_height as f32,
+        base: setup.base,
+        grid,
+        low: setup.bounds.min,
+        frame,
+        high: setup.bounds.max,
+        level_set: u32::from(scene.level_set),
+        sun: f(setup.sun),
+        extinction: scene.extinction as f32,
+        sun_world: f(setup.sun_world),
+        threshold: scene.threshold,
+        normal_x: f(setup.normals[0]),
+        width: scene.size[0],
+        normal_y: f(setup.normals[1]),
+        height: scene.size[1],
+        normal_z: f(setup.normals[2]),
+        ambient: AMBIENT as f32,
+    })
+}
+
+const _: () = {
+    assert!(size_of::<Params>() == 13 * 16 - 16);
+    assert!(Mode::Density as u32 == 0 && Mode::Depth as u32 == 1 && Mode::First as u32 == 2);
+    assert!(Mode::Bricks as u32 == 3 && Mode::Steps as u32 == 4 && Mode::Nodes as u32 == 5);
+    assert!(Mode::Normals as u32 == 6 && Mode::Lit as u32 == 7);
+};

@@ -1,0 +1,75 @@
+//! Pictures: a CPU tracer that is slow and obviously right, and a wgpu tracer that reads a pack as an
+//! engine does.
+//!
+//! Both trace the same rays through the same unit cells and write the same numbers, so that pictures of
+//! a pack can be compared with pictures of its source, and the shader with the CPU.
+//!
+//! Space: a fog voxel (i, j, k) is the cube around its index coordinate, so rays are moved by half a
+//! voxel and then voxel (i, j, k) is the *cell* from (i, j, k) to (i + 1, j + 1, k + 1). A level set is
+//! sampled at index coordinates and interpolated between them: its cells have eight voxels as corners.
+
+mod camera;
+mod cpu;
+mod field;
+pub mod gpu;
+mod image;
+mod surface;
+mod traverse;
+
+pub use camera::{Camera, CameraError, View};
+pub use cpu::{Scene, trace};
+pub use field::Field;
+pub use image::{Difference, Image, difference, write_apng, write_png};
+pub use traverse::{Box3, Ray, Real, Walk};
+
+use clap::ValueEnum;
+
+/// What a picture shows.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Mode {
+    /// Density accumulated along the ray, as opacity (Beer-Lambert); level sets: the same as lit
+    Density,
+    /// Distance to the first hit
+    Depth,
+    /// Density of the first hit; level sets: 1
+    First,
+    /// A hue for each brick that is hit first
+    Bricks,
+    /// How many steps a ray took
+    Steps,
+    /// The boundaries of the first node hit: L3 cyan, L2 red, L1 blue
+    Nodes,
+    /// The normal of the face through which the first hit was entered; level sets: of the surface
+    Normals,
+    /// A level set in the sun, with its shadow
+    Lit,
+}
+
+impl Mode {
+    /// Every mode.
+    pub const ALL: [Self; 8] = [
+        Self::Density,
+        Self::Depth,
+        Self::First,
+        Self::Bricks,
+        Self::Steps,
+        Self::Nodes,
+        Self::Normals,
+        Self::Lit,
+    ];
+
+    /// Whether pixels are categories, which two tracers share or do not, rather than measures.
+    pub fn is_categorical(self) -> bool {
+        matches!(self, Self::Bricks | Self::Steps | Self::Nodes | Self::Normals)
+    }
+}
+
+/// How a ray steps.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum Traversal {
+    /// Cell by cell
+    Dda,
+    /// Over every empty or constant node in one step
+    #[default]
+    Hdda,
+}

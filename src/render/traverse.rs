@@ -1,0 +1,256 @@
+//! Cells along a ray, one at a time (DDA) or a node at a time (HDDA).
+//!
+//! A ray crosses plane `k` of axis `a` at `t(a, k) = (k − o_a) / d_a`, always computed from the plane's
+//! number and never accumulated. Its crossings, ordered by `t` and among equals by axis, are *the* order
+//! in which cells are visited. A DDA takes the next crossing; an HDDA takes the crossing that leaves a
+//! node, and with it all those that come before it. Both read the same sequence, so HDDA visits exactly
+//! the cells of DDA less those that it skipped: no nudge over an edge, nothing skipped, nothing twice,
+//! also in `f32`, whose rounding can move a crossing but not reorder one axis's own.
+
+/// `f32` as the shader has it, or `f64` as the reference.
+pub trait Real:
+    Copy
+    + PartialOrd
+    + std::fmt::Debug
+    + std::ops::Add<Output = Self>
+    + std::ops::Sub<Output = Self>
+    + std::ops::Mul<Output = Self>
+    + std::ops::Div<Output = Self>
+    + std::ops::Neg<Output = Self>
+    + Send
+    + Sync
+    + 'static
+{
+    /// Later than any crossing.
+    const FAR: Self;
+    /// The nearest number of this type.
+    fn from_f64(v: f64) -> Self;
+    /// Exact.
+    fn to_f64(self) -> f64;
+    /// The integer below, saturating.
+    fn floor_i32(self) -> i32;
+    /// Exact up to 2^24.
+    fn from_i32(v: i32) -> Self;
+    /// e to this power.
+    fn exp(self) -> Self;
+    /// The square root.
+    fn sqrt(self) -> Self;
+}
+
+macro_rules! real {
+    ($t:ty) => {
+        impl Real for $t {
+            const FAR: Self = 3.0e38;
+            fn from_f64(v: f64) -> Self {
+                v as $t
+            }
+            fn to_f64(self) -> f64 {
+                self.into()
+            }
+            fn floor_i32(self) -> i32 {
+                self.floor() as i32
+            }
+            fn from_i32(v: i32) -> Self {
+                v as $t
+            }
+            fn exp(self) -> Self {
+                <$t>::exp(self)
+            }
+            fn sqrt(self) -> Self {
+                <$t>::sqrt(self)
+            }
+        }
+    };
+}
+real!(f32);
+real!(f64);
+
+/// Cells farther out than this are not told apart: `f32` has no fractions left there.
+const MAX_CELL: i32 = 1 << 24;
+
+/// A ray in cell space.
+#[derive(Clone, Copy, Debug)]
+pub struct Ray<F> {
+    /// Where `t` is 0.
+    pub origin: [F; 3],
+    /// What `t` of 1 adds.
+    pub direction: [F; 3],
+    inverse: [F; 3],
+}
+
+/// A box of cells, `min` inside and `max` outside.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Box3 {
+    /// The first cell.
+    pub min: [i32; 3],
+    /// The cell behind the last.
+    pub max: [i32; 3],
+}
+
+impl Box3 {
+    /// The cube of side `dim` at `min`.
+    pub fn cube(min: [i32; 3], dim: i32) -> Self {
+        Self { min, max: min.map(|v| v + dim) }
+    }
+
+    /// The part of this box that is inside `other`.
+    pub fn within(&self, other: Self) -> Self {
+        Self {
+            min: std::array::from_fn(|a| self.min[a].max(other.min[a])),
+            max: std::array::from_fn(|a| self.max[a].min(other.max[a])),
+        }
+    }
+
+    /// A cell more on the low side: where cells have eight voxels as corners, the first voxels are
+    /// corners of those too.
+    pub fn grown(&self) -> Self {
+        Self { min: self.min.map(|v| v - 1), max: self.max }
+    }
+
+    /// Whether `cell` is inside.
+    pub fn contains(&self, cell: [i32; 3]) -> bool {
+        (0..3).all(|a| self.min[a] <= cell[a] && cell[a] < self.max[a])
+    }
+}
+
+/// A crossing: when, and through planes of which axis.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Crossing<F> {
+    t: F,
+    axis: usize,
+}
+
+impl<F: Real> Crossing<F> {
+    fn before(self, other: Self) -> bool {
+        self.t < other.t || self.t == other.t && self.axis < other.axis
+    }
+}
+
+impl<F: Real> Ray<F> {
+    /// A ray. `direction` need not be a unit vector; zero components of either sign are fine.
+    pub fn new(origin: [F; 3], direction: [F; 3]) -> Self {
+        let one = F::from_i32(1);
+        let inverse = direction.map(|d| if d == F::from_i32(0) { one } else { one / d });
+        Self { origin, direction, inverse }
+    }
+
+    /// The crossing of plane `k` of an axis; [`Real::FAR`] if the ray never does.
+    fn crossing(&self, axis: usize, k: i32) -> Crossing<F> {
+        let t = if self.direction[axis] == F::from_i32(0) {
+            F::FAR
+        } else {
+            (F::from_i32(k) - self.origin[axis]) * self.inverse[axis]
+        };
+        Crossing { t, axis }
+    }
+
+    fn forward(&self, axis: usize) -> bool {
+        self.direction[axis] > F::from_i32(0)
+    }
+
+    /// The cell on `axis` after all crossings of that axis that come before `event`, if it was `from`
+    /// before them and can be at most `to`.
+    fn cell_at(&self, event: Crossing<F>, axis: usize, from: i32, to: i32) -> i32 {
+        if from == to || self.direction[axis] == F::from_i32(0) {
+            return from;
+        }
+        let guess = (self.origin[axis] + self.direction[axis] * event.t).floor_i32();
+        if self.forward(axis) {
+            let mut cell = guess.clamp(from, to);
+            while cell < to && self.crossing(axis, cell + 1).before(event) {
+                cell += 1;
+            }
+            while cell > from && !self.crossing(axis, cell).before(event) {
+                cell -= 1;
+            }
+            cell
+        } else {
+            let mut cell = guess.clamp(to, from);
+            while cell > to && self.crossing(axis, cell).before(event) {
+                cell -= 1;
+            }
+            while cell < from && !self.crossing(axis, cell + 1).before(event) {
+                cell += 1;
+            }
+            cell
+        }
+    }
+}
+
+/// A place on a ray: the cell it is in, and since when.
+#[derive(Clone, Copy, Debug)]
+pub struct Walk<F> {
+    /// The cell.
+    pub cell: [i32; 3],
+    /// When the ray entered it; 0 for the cell that it starts in.
+    pub t: F,
+    /// The axis of the face through which it entered; 3 for the cell that it starts in.
+    pub axis: usize,
+}
+
+impl<F: Real> Walk<F> {
+    /// The first cell of `bounds` on the ray; `None` if it misses.
+    pub fn enter(ray: &Ray<F>, bounds: Box3) -> Option<Self> {
+        let start = ray.origin.map(|o| o.floor_i32().clamp(-MAX_CELL, MAX_CELL));
+        let mut event: Option<Crossing<F>> = None;
+        for a in 0..3 {
+            let plane = if start[a] < bounds.min[a] && ray.forward(a) {
+                bounds.min[a]
+            } else if start[a] >= bounds.max[a] && !ray.forward(a) {
+                bounds.max[a]
+            } else if start[a] >= bounds.min[a] && start[a] < bounds.max[a] {
+                continue;
+            } else {
+                return None;
+            };
+            let crossing = ray.crossing(a, plane);
+            if event.is_none_or(|e| e.before(crossing)) {
+                event = Some(crossing);
+            }
+        }
+        let Some(event) = event else { return Some(Self { cell: start, t: F::from_i32(0), axis: 3 }) };
+        if event.t >= F::FAR {
+            return None;
+        }
+        let mut cell = start;
+        for (a, cell) in cell.iter_mut().enumerate() {
+            *cell = match (a == event.axis, ray.forward(a)) {
+                (true, true) => bounds.min[a],
+                (true, false) => bounds.max[a] - 1,
+                (false, true) => ray.cell_at(event, a, *cell, bounds.max[a].max(*cell)),
+                (false, false) => ray.cell_at(event, a, *cell, (bounds.min[a] - 1).min(*cell)),
+            };
+        }
+        bounds.contains(cell).then_some(Self { cell, t: event.t, axis: event.axis })
+    }
+
+    /// The crossing that leaves `node`, which holds the cell: its time and axis.
+    pub fn exit(&self, ray: &Ray<F>, node: Box3) -> (F, usize) {
+        let plane = |a: usize| if ray.forward(a) { node.max[a] } else { node.min[a] };
+        let mut first = ray.crossing(0, plane(0));
+        for a in 1..3 {
+            let crossing = ray.crossing(a, plane(a));
+            if crossing.before(first) {
+                first = crossing;
+            }
+        }
+        (first.t, first.axis)
+    }
+
+    /// Goes on to the first cell behind `node`, which holds the cell. With a node of one cell this is a
+    /// DDA's step.
+    pub fn leave(&mut self, ray: &Ray<F>, node: Box3) {
+        let (t, axis) = self.exit(ray, node);
+        let event = Crossing { t, axis };
+        for a in 0..3 {
+            self.cell[a] = match (a == axis, ray.forward(a)) {
+                (true, true) => node.max[a],
+                (true, false) => node.min[a] - 1,
+                (false, true) => ray.cell_at(event, a, self.cell[a], node.max[a] - 1),
+                (false, false) => ray.cell_at(event, a, self.cell[a], node.min[a]),
+            };
+        }
+        self.t = t;
+        self.axis = axis;
+    }
+}
