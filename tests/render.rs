@@ -112,7 +112,15 @@ fn the_shader_sees_what_the_cpu_sees() {
                         _ => 1e-5,
                     };
                     let (n, most) = differing(&twin, &ours, 0..4, tolerance);
-                    println!("{name} {format:?} {mode:?} {traversal:?}: {n} pixels differ, at most {most}");
+                    // In a category a ray that meets an edge may go to either side: 0.1 % of pixels. BC4 moves
+                    // edges, and with them hits.
+                    let pixels = (SIZE[0] * SIZE[1]) as usize;
+                    let allowed = match format {
+                        Format::Bc4 => pixels / 200,
+                        _ if mode.is_categorical() => pixels / 1000,
+                        _ => 0,
+                    };
+                    assert!(n <= allowed, "{name} {format:?} {mode:?} {traversal:?}: {n} pixels, at most {most}");
                 }
             }
         }

@@ -254,3 +254,136 @@ impl<F: Real> Walk<F> {
         self.axis = axis;
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const BOUNDS: Box3 = Box3 { min: [-40; 3], max: [40; 3] };
+
+    /// The cells of a ray, stepping over whatever node `node` says a cell is in.
+    fn cells<F: Real>(ray: &Ray<F>, node: impl Fn([i32; 3]) -> Box3) -> Vec<[i32; 3]> {
+        let mut out = Vec::new();
+        let Some(mut walk) = Walk::enter(ray, BOUNDS) else { return out };
+        while BOUNDS.contains(walk.cell) {
+            out.push(walk.cell);
+            walk.leave(ray, node(walk.cell).within(BOUNDS));
+            assert!(out.len() < 400, "the walk does not end");
+        }
+        out
+    }
+
+    fn unit(cell: [i32; 3]) -> Box3 {
+        Box3::cube(cell, 1)
+    }
+
+    /// Empty nodes of side 8 and 32 in a pattern; the rest is cells.
+    fn nodes(cell: [i32; 3]) -> Box3 {
+        for (dim, keep) in [(32, 3), (8, 2)] {
+            let origin = cell.map(|c: i32| c.div_euclid(dim) * dim);
+            let hash = origin.iter().fold(7i32, |h, o| h.wrapping_mul(31).wrapping_add(*o / dim)) & 0xff;
+            if hash % keep == 0 {
+                return Box3::cube(origin, dim);
+            }
+        }
+        unit(cell)
+    }
+
+    /// Origins inside, on faces, edges and corners, outside, and far away.
+    fn origin() -> impl Strategy<Value = [f32; 3]> {
+        let one = prop_oneof![
+            3 => -60f32..60.0,
+            3 => (-60i32..60).prop_map(|v| v as f32),
+            1 => prop_oneof![Just(1e5f32), Just(-1e5), -1e5f32..1e5],
+        ];
+        proptest::array::uniform3(one)
+    }
+
+    /// Random, axis-parallel and diagonal directions, and zeros of either sign.
+    fn direction() -> impl Strategy<Value = [f32; 3]> {
+        let one = prop_oneof![
+            4 => -1f32..1.0,
+            2 => prop_oneof![Just(0.0f32), Just(-0.0)],
+            2 => prop_oneof![Just(1.0f32), Just(-1.0)],
+            1 => prop_oneof![Just(1e-6f32), Just(-1e-6)],
+        ];
+        proptest::array::uniform3(one).prop_filter("a direction", |d| d.iter().any(|v| *v != 0.0))
+    }
+
+    /// Rays that are aimed at the box, from wherever: half of them at a corner of its cells, where
+    /// rounding decides.
+    fn ray() -> impl Strategy<Value = ([f32; 3], [f32; 3])> {
+        let target = prop_oneof![
+            3 => proptest::array::uniform3(-40f32..40.0),
+            3 => proptest::array::uniform3((-40i32..40).prop_map(|v| v as f32)),
+        ];
+        let scale = prop_oneof![Just(1f32), Just(1.0 / 3.0), Just(1e-3), Just(700.0)];
+        (origin(), direction(), proptest::option::weighted(0.8, target), scale).prop_map(
+            |(origin, direction, target, scale)| match target {
+                Some(t) if t != origin => (origin, std::array::from_fn(|a| (t[a] - origin[a]) * scale)),
+                _ => (origin, direction),
+            },
+        )
+    }
+
+    /// How long, in cells, the ray is inside a cell grown by `grow` on every side, in f64.
+    fn overlap(origin: [f64; 3], direction: [f64; 3], cell: [i32; 3], grow: f64) -> f64 {
+        let (mut enter, mut leave) = (0f64, f64::INFINITY);
+        for a in 0..3 {
+            let (low, high) = (f64::from(cell[a]) - grow, f64::from(cell[a]) + 1.0 + grow);
+            if direction[a] == 0.0 {
+                if origin[a] < low || origin[a] > high {
+                    return -1.0;
+                }
+                continue;
+            }
+            let (p, q) = ((low - origin[a]) / direction[a], (high - origin[a]) / direction[a]);
+            enter = enter.max(p.min(q));
+            leave = leave.min(p.max(q));
+        }
+        (leave - enter) * direction.iter().map(|d| d * d).sum::<f64>().sqrt()
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(10_000))]
+
+        #[test]
+        fn hdda_visits_the_cells_of_dda((origin, direction) in ray()) {
+            let ray = Ray::new(origin, direction);
+            let dda = cells(&ray, unit);
+            let hdda = cells(&ray, nodes);
+            // Of each run of DDA cells in one node, HDDA has the first.
+            let mut expected: Vec<[i32; 3]> = Vec::new();
+            for &cell in &dda {
+                if expected.last().is_none_or(|last| !nodes(*last).contains(cell)) {
+                    expected.push(cell);
+                }
+            }
+            prop_assert_eq!(hdda, expected);
+        }
+
+        #[test]
+        fn f32_misses_nothing_and_adds_nothing((origin, direction) in ray()) {
+            let seen = cells(&Ray::new(origin, direction), unit);
+            for pair in seen.windows(2) {
+                let steps: i32 = (0..3).map(|a| (pair[0][a] - pair[1][a]).abs()).sum();
+                prop_assert_eq!(steps, 1, "from {:?} to {:?}", pair[0], pair[1]);
+            }
+            let (o, d) = (origin.map(f64::from), direction.map(f64::from));
+            let exact = cells(&Ray::new(o, d), unit);
+            for cell in seen.iter().chain(&exact) {
+                // How far f32 may be off at this distance: a crossing's time has three roundings, and a
+                // ray that is not axis-parallel turns time into up to that many cells on each axis.
+                let distance = (0..3).map(|a| (f64::from(cell[a]) - o[a]).powi(2)).sum::<f64>().sqrt() + 2.0;
+                let epsilon = 4.0 * f64::from(f32::EPSILON) * distance;
+                if seen.contains(cell) {
+                    prop_assert!(overlap(o, d, *cell, epsilon) >= 0.0, "{cell:?} is not on the ray");
+                } else {
+                    prop_assert!(overlap(o, d, *cell, 0.0) <= 2.0 * epsilon, "{cell:?} is missing");
+                }
+            }
+        }
+    }
+}
