@@ -58,6 +58,9 @@ pub enum Error {
         /// The value.
         source: OutOfRange,
     },
+    /// A device that failed, or another thing that should not happen.
+    #[error("{0}")]
+    Other(String),
     /// A pack that does not say what its source says.
     #[error("{0}")]
     Verify(String),
@@ -92,6 +95,7 @@ impl Error {
                 std::io::ErrorKind::NotFound | std::io::ErrorKind::PermissionDenied => 3,
                 _ => 1,
             },
+            Self::Other(_) => 1,
             Self::Usage(_) => 2,
             Self::Vdb { source, .. } if source.is_unsupported() => 6,
             Self::Pack { source, .. } if source.is_unsupported() => 6,

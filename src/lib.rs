@@ -23,13 +23,15 @@
 //! ```no_run
 //! use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 //! use volpack::settings::{Format, Settings};
+//! use volpack::verify::PictureSettings;
 //!
 //! let job = Job {
 //!     frames: vec!["smoke.vdb".into()],
 //!     output: "smoke.volpack".into(),
 //!     settings: Settings { format: Format::Bc7, ..Settings::default() },
 //!     strict: false,
-//!     verify: VerifyLevel::Voxels,
+//!     verify: VerifyLevel::All,
+//!     pictures: PictureSettings::default(),
 //! };
 //! let outcome = build(&job, &mut Silent)?;
 //! assert!(outcome.verification.is_some_and(|report| report.ok));

@@ -27,6 +27,8 @@ pub struct Asset {
     pub output: PathBuf,
     /// How it is made.
     pub settings: Settings,
+    /// The largest mean FLIP of its pictures.
+    pub max_flip: Option<f64>,
 }
 
 #[derive(Deserialize)]
@@ -52,6 +54,7 @@ struct RawAsset {
     nonfinite: NonFinite,
     zstd: Option<toml::Spanned<i32>>,
     fps: Option<toml::Spanned<f32>>,
+    max_flip: Option<f64>,
     output: Option<PathBuf>,
 }
 
@@ -122,6 +125,7 @@ impl RawAsset {
         Ok(Asset {
             frames: frames.into_iter().map(|f| folder.join(f)).collect(),
             output: folder.join(output),
+            max_flip: self.max_flip,
             settings: Settings {
                 grids,
                 format: self.format,

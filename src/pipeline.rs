@@ -16,7 +16,7 @@ use crate::stages::quantise::QuantiseError;
 use crate::stages::select::{SelectedGrid, Selection, find, select};
 use crate::stages::serialise::{FrameInput, GridInput, SerialiseError, serialise};
 use crate::vdb::{GridClass, VdbFile};
-use crate::verify::{self, VerifyReport};
+use crate::verify::{self, PictureSettings, Sources, VerifyReport};
 
 /// How much a finished pack is checked.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, clap::ValueEnum)]
@@ -26,8 +26,10 @@ pub enum VerifyLevel {
     /// Digests, offsets, indices and counts
     Structure,
     /// Those, and every voxel against the source
-    #[default]
     Voxels,
+    /// Those, and pictures of pack and source
+    #[default]
+    All,
 }
 
 /// One pack to build.
@@ -43,6 +45,8 @@ pub struct Job {
     pub strict: bool,
     /// How much is checked afterwards.
     pub verify: VerifyLevel,
+    /// How pictures are compared.
+    pub pictures: PictureSettings,
 }
 
 /// Hears how a build is getting on. Called from one thread at a time.
@@ -117,14 +121,34 @@ pub fn build(job: &Job, progress: &mut dyn Progress) -> Result<Outcome> {
             check_structure(&job.output)?;
             None
         }
-        VerifyLevel::Voxels => {
+        VerifyLevel::Voxels | VerifyLevel::All => {
             let pack = check_structure(&job.output)?;
-            progress.stage("verify", sequence.frames.len() as u64, "frames");
-            Some(verify::voxels(&pack, &job.frames, |frames| progress.advance(frames))?)
+            let pictures = (job.verify == VerifyLevel::All).then_some(&job.pictures);
+            Some(verify_against(&pack, &job.frames, pictures, progress)?)
         }
     };
     clock.lap("verify");
     Ok(Outcome { warnings, seconds: clock.laps, verification })
+}
+
+/// Compares a pack's voxels, and pictures where settings for them are given, with its sources.
+///
+/// # Errors
+/// When a source is missing, changed or unreadable, or the pack is damaged. Differences are no error:
+/// they are in the report.
+pub fn verify_against(
+    pack: &Pack,
+    files: &[PathBuf],
+    pictures: Option<&PictureSettings>,
+    progress: &mut dyn Progress,
+) -> Result<VerifyReport> {
+    progress.stage("verify", files.len() as u64, "frames");
+    let sources = Sources::find(pack, files)?;
+    let mut report = verify::voxels(pack, &sources, |frames| progress.advance(frames))?;
+    if let Some(settings) = pictures {
+        report.add_pictures(verify::pictures(pack, &sources, settings)?);
+    }
+    Ok(report)
 }
 
 /// Opens a pack and checks every byte of it that can be checked without its source.

@@ -95,6 +95,7 @@ fn values_past_half_are_refused_by_name() {
         settings: settings("huge_range", Format::F16),
         strict: false,
         verify: volpack::pipeline::VerifyLevel::Voxels,
+        pictures: Default::default(),
     };
     let error = volpack::pipeline::build(&job, &mut volpack::pipeline::Silent).err().unwrap();
     assert!(error.to_string().contains("huge_range") && error.to_string().contains("f16"), "{error}");

@@ -60,8 +60,11 @@ fn a_reader_written_from_the_specification_sees_the_same_voxels() {
             let grids = grids.iter().map(|g| (*g).to_owned()).collect();
             let settings = Settings { grids, format, zstd: 0, ..Settings::default() };
             let (pack, _) = build_verified(&frames, settings, folder.path());
-            let output =
-                Command::new("python3").arg(&script).arg(folder.path().join("test.volpack")).output().unwrap();
+            let output = Command::new("python3")
+                .arg(&script)
+                .arg(folder.path().join("test.volpack"))
+                .output()
+                .unwrap();
             assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
             let text = String::from_utf8(output.stdout).unwrap();
             let mut theirs = text.lines().map(|line| serde_json::from_str::<Json>(line).unwrap());

@@ -38,7 +38,9 @@ impl Rng {
     pub fn new(seed: u64, case: u64) -> Self {
         // Neighbouring cases must not resemble each other, and the state must not be zero.
         let mut rng = Self((seed ^ case.wrapping_mul(0x9e37_79b9_7f4a_7c15)) | 1);
-        (0..8).for_each(|_| drop(rng.bits()));
+        for _ in 0..8 {
+            rng.bits();
+        }
         rng
     }
 
@@ -104,7 +106,7 @@ fn step(rng: &mut Rng, bytes: &mut Vec<u8>, hot: &[Range<usize>], other: &[u8]) 
         return;
     }
     let area = area(rng, bytes.len(), hot);
-    match rng.below(12) {
+    match rng.below(13) {
         0..=2 => {
             for _ in 0..*rng.pick(&[1, 1, 2, 4, 16]) {
                 bytes[at(rng, &area)] ^= 1 << rng.below(8);
@@ -137,6 +139,10 @@ fn step(rng: &mut Rng, bytes: &mut Vec<u8>, hot: &[Range<usize>], other: &[u8]) 
             } else {
                 bytes[block].fill(0);
             }
+        }
+        11 => {
+            let at = at(rng, &area);
+            if rng.below(2) == 0 { same_words::<4>(rng, bytes, at) } else { same_words::<8>(rng, bytes, at) }
         }
         // The front of one file and the back of another, or a piece of it in the middle.
         _ => {
@@ -187,4 +193,20 @@ fn word<const BYTES: usize>(rng: &mut Rng, bytes: &mut [u8], at: usize) {
         _ => rng.bits(),
     };
     bytes[at..at + len].copy_from_slice(&new.to_le_bytes()[..len]);
+}
+
+/// Overwrites every copy of a word, so that an offset or a count that is written down twice still agrees
+/// with itself.
+fn same_words<const BYTES: usize>(rng: &mut Rng, bytes: &mut [u8], at: usize) {
+    let at = at & !3;
+    let Some(old) = bytes.get(at..at + BYTES).map(<[u8]>::to_vec) else { return };
+    word::<BYTES>(rng, bytes, at);
+    let new = bytes[at..at + BYTES].to_vec();
+    if old.iter().any(|&byte| byte != 0) {
+        for place in (0..=bytes.len() - BYTES).step_by(4) {
+            if bytes[place..place + BYTES] == old {
+                bytes[place..place + BYTES].copy_from_slice(&new);
+            }
+        }
+    }
 }

@@ -101,6 +101,7 @@ pub fn build_packs(fixtures: &Path, out: &Path) -> Result<()> {
                     settings: Settings { grids: grids.clone(), format, zstd, ..Settings::default() },
                     strict: false,
                     verify: VerifyLevel::None,
+                    pictures: Default::default(),
                 };
                 build(&job, &mut Silent)?;
             }

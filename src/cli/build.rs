@@ -81,12 +81,13 @@ fn build_one(name: &str, job: &Job, args: &BuildArgs, common: Common) -> Result<
 
 /// The packs that the arguments ask for, with the names to show.
 fn jobs(args: &BuildArgs) -> Result<Vec<(String, Job)>> {
-    let job = |frames, output: &Path, settings| Job {
+    let job = |frames, output: &Path, settings, max_flip| Job {
         frames,
         output: output.to_owned(),
         settings,
         strict: args.strict,
         verify: args.verify.verify,
+        pictures: args.verify.pictures.settings(max_flip),
     };
     if !args.frames.is_empty() {
         let output = args
@@ -94,7 +95,7 @@ fn jobs(args: &BuildArgs) -> Result<Vec<(String, Job)>> {
             .as_deref()
             .ok_or_else(|| Error::Usage("FILES need a pack to go into: add -o OUT.volpack".to_owned()))?;
         let name = output.file_stem().map_or_else(|| "pack".into(), |s| s.to_string_lossy().into_owned());
-        return Ok(vec![(name, job(files(&args.frames)?, output, args.settings.settings()))]);
+        return Ok(vec![(name, job(files(&args.frames)?, output, args.settings.settings(), None))]);
     }
     if !args.manifest.exists() {
         return Err(Error::Usage(format!(
@@ -113,7 +114,7 @@ fn jobs(args: &BuildArgs) -> Result<Vec<(String, Job)>> {
     }
     let named = |name: &String| {
         let asset = manifest.asset(name)?;
-        Ok((name.clone(), job(expand(&asset.frames)?, &asset.output, asset.settings.clone())))
+        Ok((name.clone(), job(expand(&asset.frames)?, &asset.output, asset.settings.clone(), asset.max_flip)))
     };
     names.into_iter().map(named).collect()
 }

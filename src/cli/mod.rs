@@ -3,6 +3,7 @@
 mod build;
 mod inspect;
 mod progress;
+mod render;
 mod style;
 mod verify;
 
@@ -12,7 +13,9 @@ use clap::{Args, Parser, Subcommand};
 
 use crate::error::{Error, Result};
 use crate::pipeline::VerifyLevel;
+use crate::render::Device;
 use crate::settings::{DEFAULT_ZSTD, Format, Masks, NonFinite, RangeMode, Settings};
+use crate::verify::PictureSettings;
 
 const EXIT_CODES: &str = "\
 Exit codes:
@@ -56,6 +59,8 @@ enum Command {
     Inspect(inspect::InspectArgs),
     /// Prove a pack against its source
     Verify(verify::VerifyArgs),
+    /// Trace pictures of a pack
+    Render(render::RenderArgs),
 }
 
 /// How a pack is made, for builds without a manifest.
@@ -109,8 +114,38 @@ impl SettingsArgs {
 #[derive(Args)]
 struct VerifyArg {
     /// How much of the finished pack is checked
-    #[arg(long, value_name = "LEVEL", default_value = "voxels")]
+    #[arg(long, value_name = "LEVEL", default_value = "all")]
     verify: VerifyLevel,
+    #[command(flatten)]
+    pictures: PictureArgs,
+}
+
+/// How pictures are compared, as the command line has it.
+#[derive(Args)]
+struct PictureArgs {
+    /// Write source, pack and difference side by side into this folder
+    #[arg(long, value_name = "DIR")]
+    images: Option<PathBuf>,
+    /// The largest mean FLIP that passes [default: by format, or as the manifest says]
+    #[arg(long, value_name = "FLIP", value_parser = positive_f64)]
+    max_flip: Option<f64>,
+    /// What traces the pack as an engine would
+    #[arg(long, default_value = "auto")]
+    device: Device,
+}
+
+fn positive_f64(text: &str) -> std::result::Result<f64, String> {
+    positive(text).map(f64::from)
+}
+
+impl PictureArgs {
+    fn settings(&self, max_flip: Option<f64>) -> PictureSettings {
+        PictureSettings {
+            max_flip: self.max_flip.or(max_flip),
+            images: self.images.clone(),
+            device: self.device,
+        }
+    }
 }
 
 /// Runs the command that the arguments ask for.
@@ -128,6 +163,7 @@ pub fn run(cli: Cli) -> Result<()> {
         Command::Build(args) => build::run(&args, cli.common),
         Command::Inspect(args) => inspect::run(&args),
         Command::Verify(args) => verify::run(&args, cli.common),
+        Command::Render(args) => render::run(&args, cli.common),
     }
 }
 

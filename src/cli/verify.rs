@@ -7,11 +7,11 @@ use serde_json::json;
 
 use super::progress::Reporter;
 use super::style::{ERROR, GOOD, TITLE, psnr};
-use super::{Common, files, print_json};
+use super::{Common, PictureArgs, files, print_json};
 use crate::error::{Error, Result};
 use crate::manifest::{DEFAULT_NAME, Manifest, expand};
-use crate::pipeline::{Progress, check_structure};
-use crate::verify::{self, VerifyReport};
+use crate::pipeline::{check_structure, verify_against};
+use crate::verify::{PicturesReport, VerifyReport};
 
 #[derive(Args)]
 pub struct VerifyArgs {
@@ -24,8 +24,10 @@ pub struct VerifyArgs {
     #[arg(short, long, value_name = "FILE", default_value = DEFAULT_NAME)]
     manifest: PathBuf,
     /// How much is checked
-    #[arg(long, value_name = "RING", default_value = "voxels")]
+    #[arg(long, value_name = "RING", default_value = "all")]
     level: Level,
+    #[command(flatten)]
+    pictures: PictureArgs,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -37,6 +39,8 @@ enum Level {
     Structure,
     /// Those, and every voxel against the source
     Voxels,
+    /// Those, and pictures of pack and source
+    All,
 }
 
 pub fn run(args: &VerifyArgs, common: Common) -> Result<()> {
@@ -49,10 +53,12 @@ pub fn run(args: &VerifyArgs, common: Common) -> Result<()> {
         }
         return Ok(());
     }
-    let sources = if args.source.is_empty() { sources_in_manifest(args)? } else { files(&args.source)? };
+    let (sources, max_flip) =
+        if args.source.is_empty() { sources_in_manifest(args)? } else { (files(&args.source)?, None) };
+    let settings = args.pictures.settings(max_flip);
     let mut reporter = Reporter::new("verify", common.quiet || args.json);
-    reporter.stage("voxels", sources.len() as u64, "frames");
-    let report = verify::voxels(&pack, &sources, |frames| reporter.advance(frames));
+    let pictures = (args.level == Level::All).then_some(&settings);
+    let report = verify_against(&pack, &sources, pictures, &mut reporter);
     reporter.finish();
     let report = report?;
     if args.json {
@@ -79,7 +85,8 @@ pub fn verdict(pack: &Path, report: &VerifyReport) -> Result<()> {
     )))
 }
 
-fn sources_in_manifest(args: &VerifyArgs) -> Result<Vec<PathBuf>> {
+/// The files that the manifest builds the pack from, and its limit for pictures.
+fn sources_in_manifest(args: &VerifyArgs) -> Result<(Vec<PathBuf>, Option<f64>)> {
     let unknown = || {
         Error::Usage(format!(
             "{}: which files was it made from? Give --source FILES, or a manifest that builds it with -m",
@@ -92,7 +99,8 @@ fn sources_in_manifest(args: &VerifyArgs) -> Result<Vec<PathBuf>> {
     let manifest = Manifest::read(&args.manifest)?;
     let pack = args.pack.canonicalize().map_err(Error::io(&args.pack))?;
     let asset = manifest.assets.values().find(|a| a.output.canonicalize().is_ok_and(|output| output == pack));
-    expand(&asset.ok_or_else(unknown)?.frames)
+    let asset = asset.ok_or_else(unknown)?;
+    Ok((expand(&asset.frames)?, asset.max_flip))
 }
 
 /// The lines that say how near a pack is to its source.
@@ -111,6 +119,33 @@ pub fn print_summary(report: &VerifyReport) {
     }
     if let (Some(worst), true) = (&report.worst_frame, report.frames.len() > 1) {
         anstream::println!("    worst frame  {} of {}: {:.2} dB", worst.frame, worst.grid, worst.psnr);
+    }
+    if let Some(pictures) = &report.pictures {
+        print_pictures(pictures);
+    }
+}
+
+fn print_pictures(report: &PicturesReport) {
+    let of_tracers = report.pictures.iter().filter_map(|p| p.tracers);
+    match (&report.device, &report.skipped) {
+        (Some(device), _) => {
+            let pixels: u64 = of_tracers.map(|t| t.pixels).sum();
+            let pixels = if pixels == 0 { "no".to_owned() } else { pixels.to_string() };
+            anstream::println!("    pictures     {device} and the CPU tracer: {pixels} pixels differ");
+        }
+        (None, Some(why)) => anstream::println!("    pictures     by the CPU tracer alone: {why}"),
+        (None, None) => anstream::println!("    pictures     by the CPU tracer alone"),
+    }
+    let worst = report.pictures.iter().max_by(|a, b| a.source.flip.total_cmp(&b.source.flip));
+    if let Some(p) = worst {
+        anstream::println!(
+            "    to the eye   FLIP {:.4} of at most {:.4}, {} (frame {} of {})",
+            p.source.flip,
+            report.max_flip,
+            psnr(p.source.psnr),
+            p.frame,
+            p.grid
+        );
     }
 }
 

@@ -6,7 +6,9 @@ use std::collections::HashMap;
 use super::tree::{self, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS, header, l1_words};
 use super::{Frame, Grid, Pack, PackError};
 use crate::codec::{BrickRange, Codec, decode};
-use crate::volume::{BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, CoordBox, InactiveRule, Mask512, ROOT_DIM};
+use crate::volume::{
+    BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, CoordBox, InactiveRule, Mask512, ROOT_DIM,
+};
 
 /// The deepest thing that the tree has at some place.
 #[derive(Clone, Copy, Debug)]

@@ -18,4 +18,5 @@ pub use decode::{DecodedBrick, FrameReader, Region};
 pub use error::PackError;
 pub use provenance::{Provenance, Source};
 pub use reader::{Frame, Grid, Pack};
+pub(crate) use writer::make_readable;
 pub use writer::{PackWriter, SectionSpec, compress_chunk};

@@ -213,7 +213,7 @@ pub(super) fn tables_digest(header: &Header, sections: &[Section], chunks: &[Chu
 }
 
 /// Temporary files are made for their owner alone; a pack is for everyone, as any other output.
-fn make_readable(file: &File) -> io::Result<()> {
+pub(crate) fn make_readable(file: &File) -> io::Result<()> {
     #[cfg(unix)]
     {
         use std::os::unix::fs::PermissionsExt;

@@ -61,20 +61,28 @@ impl std::str::FromStr for View {
 const FOV: f64 = 45.0;
 
 impl View {
+    /// The length of a box's diagonal in world units.
+    pub fn diagonal(bounds: CoordBox, matrix: &[f64; 16]) -> f64 {
+        let (min, max) = ends(bounds);
+        if bounds.is_empty() { 0.0 } else { length(sub(transform(matrix, max), transform(matrix, min))) }
+    }
+
     /// The camera for a box of voxels under an index-to-world matrix.
     pub fn camera(&self, bounds: CoordBox, matrix: &[f64; 16]) -> Camera {
         let [azimuth, elevation, distance] = match *self {
             Self::Fixed(camera) => return camera,
             Self::Orbit(orbit) => orbit,
         };
-        let corner = |c: [f64; 3]| transform(matrix, c);
-        let (min, max) = (bounds.min.0.map(f64::from), bounds.max.0.map(|v| f64::from(v) + 1.0));
-        let target = corner(std::array::from_fn(|a| (min[a] + max[a]) / 2.0));
-        let diagonal = length(sub(corner(max), corner(min)));
+        let (min, max) = ends(bounds);
+        let target = transform(matrix, std::array::from_fn(|a| (min[a] + max[a]) / 2.0));
+        let diagonal = Self::diagonal(bounds, matrix);
         let (azimuth, elevation) = (azimuth.to_radians(), elevation.to_radians());
-        let direction =
-            [azimuth.sin() * elevation.cos(), elevation.sin(), azimuth.cos() * elevation.cos()];
-        Camera { eye: std::array::from_fn(|a| target[a] + direction[a] * distance * diagonal), target, fov: FOV }
+        let direction = [azimuth.sin() * elevation.cos(), elevation.sin(), azimuth.cos() * elevation.cos()];
+        Camera {
+            eye: std::array::from_fn(|a| target[a] + direction[a] * distance * diagonal),
+            target,
+            fov: FOV,
+        }
     }
 }
 
@@ -132,6 +140,11 @@ impl Lens {
         let direction = |a: usize| (f(self.forward[a]) + f(self.right[a]) * x + f(self.up[a]) * y) / length;
         Ray::new(self.origin.map(f), std::array::from_fn(direction))
     }
+}
+
+/// The two ends of a box's diagonal, in index space.
+fn ends(bounds: CoordBox) -> ([f64; 3], [f64; 3]) {
+    (bounds.min.0.map(f64::from), bounds.max.0.map(|v| f64::from(v) + 1.0))
 }
 
 fn transform(m: &[f64; 16], p: [f64; 3]) -> [f64; 3] {

@@ -5,12 +5,14 @@
 
 use rayon::prelude::*;
 
-use super::camera::{Camera, Lens, apply3, dot, invert3, length, normalise};
+use super::camera::{Camera, Lens, View, apply3, dot, invert3, length, normalise};
 use super::field::{Content, Field};
 use super::image::Image;
 use super::surface::{cubic, evaluate, first_change};
 use super::traverse::{Box3, Ray, Real, Walk};
 use super::{Mode, Traversal};
+use crate::pack::{Frame, Grid};
+use crate::vdb::GridClass;
 use crate::volume::{Coord, CoordBox, ROOT_DIM};
 
 /// What is traced, and how it looks.
@@ -32,6 +34,38 @@ pub struct Scene {
     pub extinction: f64,
     /// Densities above this are a hit.
     pub threshold: f32,
+}
+
+/// Optical depth through a whole box at its highest density: dense enough to see a surface, thin enough
+/// to see into it.
+const BOX_DEPTH: f64 = 24.0;
+/// Densities above this part of the highest are a hit.
+const HIT_DENSITY: f32 = 0.05;
+
+impl Scene {
+    /// A picture of a frame of a pack, or of its source. `voxels` is the box of what is not background.
+    pub fn new(
+        grid: &Grid,
+        frame: &Frame,
+        voxels: CoordBox,
+        view: &View,
+        mode: Mode,
+        size: [u32; 2],
+    ) -> Self {
+        let matrix = frame.record.transform;
+        let densest = f64::from(grid.record.active_max);
+        let extent = View::diagonal(voxels, &matrix) * densest;
+        Self {
+            mode,
+            traversal: Traversal::default(),
+            camera: view.camera(voxels, &matrix),
+            size,
+            matrix,
+            level_set: grid.record.class == GridClass::LevelSet as u32,
+            extinction: if extent > 0.0 { BOX_DEPTH / extent } else { 0.0 },
+            threshold: HIT_DENSITY * grid.record.active_max,
+        }
+    }
 }
 
 /// Towards the sun, in world space.
@@ -65,7 +99,8 @@ impl Setup {
     /// inverted.
     pub fn new(scene: &Scene, voxels: CoordBox) -> Option<Self> {
         let base = if voxels.is_empty() { [0; 3] } else { voxels.min.0 };
-        let size = |a: usize| if voxels.is_empty() { 0 } else { (voxels.max.0[a] - base[a]).saturating_add(1) };
+        let size =
+            |a: usize| if voxels.is_empty() { 0 } else { (voxels.max.0[a] - base[a]).saturating_add(1) };
         let bounds = Box3 { min: [0; 3], max: std::array::from_fn(size) };
         let bounds = if scene.level_set { bounds.grown() } else { bounds };
         let shift = if scene.level_set { 0.0 } else { 0.5 };
@@ -144,7 +179,7 @@ impl<F: Real> Tracer<'_, F> {
             (Some(_), Traversal::Hdda) => {
                 let min = std::array::from_fn(|a| found.origin.0[a] - self.setup.base[a]);
                 (Box3::cube(min, found.dim), constant)
-            },
+            }
             _ => (Box3::cube(cell, 1), constant),
         }
     }
@@ -176,7 +211,13 @@ impl<F: Real> Tracer<'_, F> {
         }
     }
 
-    fn first_density(&self, ray: &Ray<F>, bounds: Box3, mut walk: Walk<F>, steps: &mut u32) -> Option<Hit<F>> {
+    fn first_density(
+        &self,
+        ray: &Ray<F>,
+        bounds: Box3,
+        mut walk: Walk<F>,
+        steps: &mut u32,
+    ) -> Option<Hit<F>> {
         while bounds.contains(walk.cell) && *steps < MAX_STEPS {
             *steps += 1;
             let (node, constant) = self.node(walk.cell);
@@ -191,7 +232,13 @@ impl<F: Real> Tracer<'_, F> {
 
     /// The first zero of the interpolated field. A cell reaches over to the next voxel on each axis, so
     /// the last layer of a node's cells is taken one by one.
-    fn first_surface(&self, ray: &Ray<F>, bounds: Box3, mut walk: Walk<F>, steps: &mut u32) -> Option<Hit<F>> {
+    fn first_surface(
+        &self,
+        ray: &Ray<F>,
+        bounds: Box3,
+        mut walk: Walk<F>,
+        steps: &mut u32,
+    ) -> Option<Hit<F>> {
         let mut negative = None;
         while bounds.contains(walk.cell) && *steps < MAX_STEPS {
             *steps += 1;
@@ -313,11 +360,8 @@ impl<F: Real> Tracer<'_, F> {
 }
 
 /// Side, half width of the line in cells, and colour of what is drawn around nodes.
-const NODE_COLORS: [(i32, f64, [f32; 3]); 3] = [
-    (ROOT_DIM, 1.0, [0.1, 0.2, 1.0]),
-    (128, 0.75, [1.0, 0.15, 0.1]),
-    (8, 0.5, [0.0, 0.9, 0.9]),
-];
+const NODE_COLORS: [(i32, f64, [f32; 3]); 3] =
+    [(ROOT_DIM, 1.0, [0.1, 0.2, 1.0]), (128, 0.75, [1.0, 0.15, 0.1]), (8, 0.5, [0.0, 0.9, 0.9])];
 
 /// A hue that differs between neighbouring bricks: the same bits in the shader.
 fn brick_hue(cell: [i32; 3]) -> [f32; 3] {

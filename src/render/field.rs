@@ -5,7 +5,8 @@ use std::collections::HashMap;
 use crate::codec::Codec;
 use crate::pack::{FrameReader, PackError, Region};
 use crate::volume::{
-    BRICK_DIM, BRICK_VOXELS, CELL_DIM, CellContent, Child, Constant, Coord, CoordBox, FlatFrame, Mask512, ROOT_DIM,
+    BRICK_DIM, BRICK_VOXELS, CELL_DIM, CellContent, Child, Constant, Coord, CoordBox, FlatFrame, Mask512,
+    ROOT_DIM,
 };
 
 /// A frame as nested constants and bricks of values.
@@ -50,7 +51,13 @@ pub enum Content<'a> {
 
 impl Field {
     fn empty(background: f32) -> Self {
-        Self { background, bounds: CoordBox::EMPTY, roots: HashMap::new(), cells: HashMap::new(), bricks: Vec::new() }
+        Self {
+            background,
+            bounds: CoordBox::EMPTY,
+            roots: HashMap::new(),
+            cells: HashMap::new(),
+            bricks: Vec::new(),
+        }
     }
 
     /// A frame of the source.

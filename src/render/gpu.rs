@@ -1,5 +1,7 @@
 //! The wgpu tracer: a pack's sections uploaded as they lie in the file, and `shaders/` run on them.
 
+use std::sync::OnceLock;
+
 use bytemuck::{Pod, Zeroable};
 use wgpu::util::DeviceExt;
 
@@ -18,9 +20,9 @@ pub const TRACER_WGSL: &str = include_str!("shaders/tracer.wgsl");
 /// Why a GPU cannot trace a pack.
 #[derive(Debug, thiserror::Error)]
 pub enum GpuError {
-    /// No Vulkan, Metal or Direct3D 12 answers.
-    #[error("no GPU or software Vulkan answers: {0}")]
-    NoAdapter(String),
+    /// No Vulkan, Metal or Direct3D 12 answers, or none that can trace.
+    #[error("{0}")]
+    Unavailable(String),
     /// The adapter lacks something.
     #[error("{adapter} {what}")]
     Lacks {
@@ -89,11 +91,18 @@ struct Params {
 }
 
 impl Gpu {
-    /// Opens the best adapter.
+    /// The best adapter, opened once in a process: software Vulkan takes seconds to compile the shader.
     ///
     /// # Errors
-    /// [`GpuError::NoAdapter`] where there is none, [`GpuError::Lacks`] where it cannot hold packs.
-    pub fn open() -> Result<Self, GpuError> {
+    /// [`GpuError::Unavailable`].
+    pub fn shared() -> Result<&'static Self, GpuError> {
+        static GPU: OnceLock<Result<Gpu, String>> = OnceLock::new();
+        GPU.get_or_init(|| Self::open().map_err(|e| e.to_string()))
+            .as_ref()
+            .map_err(|e| GpuError::Unavailable(e.clone()))
+    }
+
+    fn open() -> Result<Self, GpuError> {
         // Vulkan, Metal and Direct3D 12 only: the GL backend decodes 3-D BC4 wrong.
         let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
             backends: wgpu::Backends::VULKAN | wgpu::Backends::METAL | wgpu::Backends::DX12,
@@ -104,10 +113,11 @@ impl Gpu {
             ..Default::default()
         };
         let adapter = pollster::block_on(instance.request_adapter(&options))
-            .map_err(|e| GpuError::NoAdapter(e.to_string()))?;
+            .map_err(|e| GpuError::Unavailable(format!("no GPU or software Vulkan answers: {e}")))?;
         let info = adapter.get_info();
         let lacks = |what: &str| GpuError::Lacks { adapter: info.name.clone(), what: what.to_owned() };
-        let blocks = wgpu::Features::TEXTURE_COMPRESSION_BC | wgpu::Features::TEXTURE_COMPRESSION_BC_SLICED_3D;
+        let blocks =
+            wgpu::Features::TEXTURE_COMPRESSION_BC | wgpu::Features::TEXTURE_COMPRESSION_BC_SLICED_3D;
         if !adapter.features().contains(blocks) {
             return Err(lacks("has no block-compressed 3-D textures"));
         }
@@ -155,8 +165,8 @@ impl Gpu {
             entry(2, buffer(wgpu::BufferBindingType::Storage { read_only: false })),
         ];
         entries.extend((3..8).map(|binding| entry(binding, texture)));
-        let group =
-            device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: None, entries: &entries });
+        let group = device
+            .create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: None, entries: &entries });
         device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
             bind_group_layouts: &[Some(&group)],
             ..Default::default()
@@ -196,7 +206,9 @@ impl Gpu {
                     let size = page_size(atlas);
                     if size.iter().any(|s| *s > limits.max_texture_dimension_3d) {
                         let most = limits.max_texture_dimension_3d;
-                        return Err(lacks(format!("has 3-D textures of {most} texels an axis, a page is {size:?}")));
+                        return Err(lacks(format!(
+                            "has 3-D textures of {most} texels an axis, a page is {size:?}"
+                        )));
                     }
                     bytes += atlas.bytes();
                     self.upload_page(pack, atlas, size)?
@@ -285,7 +297,12 @@ impl Gpu {
             usage: wgpu::BufferUsages::UNIFORM,
         });
         let buffer = |size, usage| {
-            self.device.create_buffer(&wgpu::BufferDescriptor { label: None, size, usage, mapped_at_creation: false })
+            self.device.create_buffer(&wgpu::BufferDescriptor {
+                label: None,
+                size,
+                usage,
+                mapped_at_creation: false,
+            })
         };
         let output = buffer(bytes, wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC);
         let readback = buffer(bytes, wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST);
@@ -373,7 +390,12 @@ struct Queries {
 impl Queries {
     fn new(device: &wgpu::Device) -> Self {
         let buffer = |usage| {
-            device.create_buffer(&wgpu::BufferDescriptor { label: None, size: 16, usage, mapped_at_creation: false })
+            device.create_buffer(&wgpu::BufferDescriptor {
+                label: None,
+                size: 16,
+                usage,
+                mapped_at_creation: false,
+            })
         };
         Self {
             set: device.create_query_set(&wgpu::QuerySetDescriptor {

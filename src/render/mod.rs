@@ -13,6 +13,7 @@ mod cpu;
 mod field;
 pub mod gpu;
 mod image;
+mod renderer;
 mod surface;
 mod traverse;
 
@@ -20,6 +21,7 @@ pub use camera::{Camera, CameraError, View};
 pub use cpu::{Scene, trace};
 pub use field::Field;
 pub use image::{Difference, Image, difference, write_apng, write_png};
+pub use renderer::{Device, Renderer};
 pub use traverse::{Box3, Ray, Real, Walk};
 
 use clap::ValueEnum;

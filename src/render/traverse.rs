@@ -6,6 +6,10 @@
 //! node, and with it all those that come before it. Both read the same sequence, so HDDA visits exactly
 //! the cells of DDA less those that it skipped: no nudge over an edge, nothing skipped, nothing twice,
 //! also in `f32`, whose rounding can move a crossing but not reorder one axis's own.
+//!
+//! Against exact arithmetic a crossing is off by three roundings, so at a distance of `D` cells a cell
+//! may be missed or added only if the ray is inside it for, or passes it by, less than `ε = 4 · 2⁻²³ · D`
+//! cells. Tested below for origins up to 100,000 cells away.
 
 /// `f32` as the shader has it, or `f64` as the reference.
 pub trait Real:

@@ -114,21 +114,24 @@ impl GridInfo {
         let tree_type = &descriptor.tree_type;
         let (tree_type, half) =
             tree_type.strip_suffix(HALF).map_or((tree_type.as_str(), false), |tree_type| (tree_type, true));
+        let value_type = ValueType::from_tree_type(tree_type);
         let parent = &descriptor.instance_parent;
         let instance_of = if parent.is_empty() {
             None
         } else {
-            let owner = earlier.iter().position(|g| g.unique_name == *parent && g.instance_of.is_none());
+            let owner = earlier.iter().position(|g| {
+                g.unique_name == *parent && g.instance_of.is_none() && g.value_type == value_type
+            });
             Some(owner.ok_or_else(|| {
                 VdbError::corrupt(
                     descriptor.at,
-                    format!("it shares the tree of {parent:?}, which is not there"),
+                    format!("it shares the tree of {parent:?}, which is not there, or of another type"),
                 )
             })?)
         };
         Ok(Self {
             name: descriptor.display_name(),
-            value_type: ValueType::from_tree_type(tree_type),
+            value_type,
             half,
             class,
             transform,

@@ -2,6 +2,7 @@
 
 use serde::Serialize;
 
+use super::PicturesReport;
 use super::compare::{Error, FrameError};
 use crate::pack::Pack;
 
@@ -75,6 +76,8 @@ pub struct VerifyReport {
     pub grids: Vec<GridReport>,
     /// Each frame of each grid.
     pub frames: Vec<FrameReport>,
+    /// The picture ring, if it ran.
+    pub pictures: Option<PicturesReport>,
 }
 
 impl Metrics {
@@ -140,6 +143,14 @@ impl VerifyReport {
             worst_frame,
             grids,
             frames,
+            pictures: None,
         }
+    }
+
+    /// Adds what the picture ring found.
+    pub fn add_pictures(&mut self, pictures: PicturesReport) {
+        self.failures.extend(pictures.failures.iter().cloned());
+        self.ok = self.failures.is_empty();
+        self.pictures = Some(pictures);
     }
 }

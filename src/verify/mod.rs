@@ -1,11 +1,12 @@
 //! Compares a pack with its source.
 //!
-//! The structure ring is [`crate::pack::Pack::open`] with [`crate::pack::Pack::check_chunks`]. The voxel
-//! ring is here: it reads the source anew and asks the pack for every leaf voxel and every tile of it,
+//! Three rings. Structure is [`crate::pack::Pack::open`] with [`crate::pack::Pack::check_chunks`]. Voxels
+//! ([`voxels`]) reads the source anew and asks the pack for every leaf voxel and every tile of it,
 //! without anything that the build computed.
 
 mod compare;
 mod metrics;
+mod pictures;
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -13,6 +14,7 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 
 pub use metrics::{FrameReport, GridReport, Metrics, VerifyReport, WorstFrame};
+pub use pictures::{PictureReport, PictureSettings, PicturesReport, TracerDifference, pictures};
 
 use crate::error::{Error, Result};
 use crate::pack::Pack;
@@ -22,14 +24,32 @@ use crate::vdb::{VdbFile, with_scalar_type};
 use crate::volume::ValueRange;
 use compare::{FrameError, compare};
 
-/// Compares every voxel of every frame with the files the pack was made from, which are told by their
-/// digests. `advance` hears of each source file that is done.
+/// The files that a pack was made from, told by their digests.
+pub struct Sources(Vec<PathBuf>);
+
+impl Sources {
+    /// Finds the pack's sources among some files.
+    ///
+    /// # Errors
+    /// When one is missing, changed or unreadable.
+    pub fn find(pack: &Pack, files: &[PathBuf]) -> Result<Self> {
+        match_sources(pack, files).map(Self)
+    }
+
+    /// The file at a place of the provenance's list.
+    fn path(&self, source: u32) -> &Path {
+        &self.0[source as usize]
+    }
+}
+
+/// Compares every voxel of every frame with the pack's sources. `advance` hears of each source file
+/// that is done.
 ///
 /// # Errors
-/// When a source is missing, changed or unreadable, or a chunk of the pack is damaged. Differences are
-/// no error: they are in the report.
-pub fn voxels(pack: &Pack, sources: &[PathBuf], mut advance: impl FnMut(u64)) -> Result<VerifyReport> {
-    let paths = match_sources(pack, sources)?;
+/// When a source is unreadable, or a chunk of the pack is damaged. Differences are no error: they are in
+/// the report.
+pub fn voxels(pack: &Pack, sources: &Sources, mut advance: impl FnMut(u64)) -> Result<VerifyReport> {
+    let paths = &sources.0;
     let mut errors: Vec<Vec<Option<FrameError>>> =
         pack.grids.iter().map(|g| g.frames.iter().map(|_| None).collect()).collect();
     let places: Vec<usize> = (0..paths.len()).collect();

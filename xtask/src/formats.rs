@@ -47,6 +47,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                     settings,
                     strict: false,
                     verify: VerifyLevel::None,
+                    pictures: Default::default(),
                 };
                 let start = Instant::now();
                 build(&job, &mut Silent)?;

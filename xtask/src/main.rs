@@ -4,9 +4,11 @@
 //! peers from Debian (`libopenvdb-dev libboost-dev libtbb-dev libimath-dev g++`) or volumes of your own.
 
 mod formats;
+mod mutate;
 mod openvdb;
 mod peers;
 mod read;
+mod trace;
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -30,6 +32,8 @@ enum Task {
         #[arg(required = true)]
         files: Vec<PathBuf>,
     },
+    /// Run mutated files and packs through every reader, in 1 GiB of memory and 10 s each
+    Mutate(mutate::Args),
     /// Read files once and print how long it took (what `bench read` runs)
     #[command(hide = true)]
     ReadOnce(read::OnceArgs),
@@ -42,13 +46,17 @@ enum Bench {
     /// Every format and range on each volume: bytes, PSNR, largest error, seconds; and the tree beside
     /// the thesis's layout
     Formats(formats::Args),
+    /// Milliseconds a frame on a GPU: every format, DDA and HDDA, at 1920 × 1080
+    Trace(trace::Args),
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
     match Cli::parse().task {
         Task::Bench(Bench::Read(args)) => read::bench(&args),
         Task::Bench(Bench::Formats(args)) => formats::bench(&args),
+        Task::Bench(Bench::Trace(args)) => trace::bench(&args),
         Task::CheckOpenvdb { files } => openvdb::check(&files),
+        Task::Mutate(args) => mutate::run(args),
         Task::ReadOnce(args) => read::once(&args),
     }
 }

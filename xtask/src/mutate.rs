@@ -1,4 +1,4 @@
-//! `cargo xtask mutate`: thousands of damaged files, each in at most 1 GiB and 10 s.
+//! `xtask mutate`: thousands of damaged files, each in at most 1 GiB and 10 s.
 //!
 //! The cases run in child processes, a batch each, so that one that aborts (as Rust does when memory
 //! runs out), overflows the stack or hangs is found and named, and the others still run. Each child is

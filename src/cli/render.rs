@@ -1,0 +1,174 @@
+//! `volpack render`.
+
+use std::fs::File;
+use std::io::BufWriter;
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+
+use super::{Common, style};
+use crate::error::{Error, Result};
+use crate::pack::Pack;
+use crate::render::gpu::GpuError;
+use crate::render::{Device, Mode, Renderer, Scene, Traversal, View, write_apng, write_png};
+use crate::vdb::GridClass;
+
+#[derive(Args)]
+pub struct RenderArgs {
+    /// The pack
+    pack: PathBuf,
+    /// The picture to write: .png, or .apng for --frames all
+    #[arg(short, long, value_name = "OUT.png")]
+    output: PathBuf,
+    /// The number of the frame [default: the first]
+    #[arg(long, value_name = "N", allow_negative_numbers = true)]
+    frame: Option<i32>,
+    /// Every frame: a contact sheet, or an animation if OUT ends in .apng
+    #[arg(long, value_name = "WHICH", conflicts_with = "frame")]
+    frames: Option<Frames>,
+    /// The grid [default: the first]
+    #[arg(short, long, value_name = "NAME")]
+    grid: Option<String>,
+    /// What the picture shows [default: density, lit for level sets]
+    #[arg(long)]
+    mode: Option<Mode>,
+    /// Pixels of a frame
+    #[arg(long, value_name = "WxH", default_value = "512x512", value_parser = size)]
+    size: [u32; 2],
+    /// orbit:AZIMUTH,ELEVATION,DISTANCE in degrees and box diagonals, or "X,Y,Z;X,Y,Z;FOV" (eye; target)
+    #[arg(long, value_name = "VIEW", default_value = "orbit:40,20,1.25")]
+    camera: View,
+    /// What traces
+    #[arg(long, default_value = "auto")]
+    device: Device,
+    /// How rays step
+    #[arg(long, default_value = "hdda")]
+    traversal: Traversal,
+}
+
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum Frames {
+    All,
+}
+
+/// The largest picture side: a terabyte of pixels is a slip of the finger.
+const MAX_SIDE: u32 = 8192;
+
+fn size(text: &str) -> std::result::Result<[u32; 2], String> {
+    let parsed = text.split_once('x').and_then(|(w, h)| Some([w.parse().ok()?, h.parse().ok()?]));
+    parsed
+        .filter(|size: &[u32; 2]| size.iter().all(|s| (1..=MAX_SIDE).contains(s)))
+        .ok_or_else(|| format!("a width and a height of 1 to {MAX_SIDE}, such as 1920x1080"))
+}
+
+pub fn run(args: &RenderArgs, common: Common) -> Result<()> {
+    let pack = Pack::open(&args.pack).map_err(Error::pack(&args.pack))?;
+    let names: Vec<&str> = pack.grids.iter().map(|g| g.name.as_str()).collect();
+    let grid = args.grid.as_ref().map_or(Some(0), |name| names.iter().position(|n| n == name));
+    let grid = grid.ok_or_else(|| {
+        Error::Usage(format!("{}: no such grid; it has {}", args.pack.display(), names.join(", ")))
+    })?;
+    let frames = frames(args, &pack, grid)?;
+    let renderer = Renderer::new(&pack, args.device).map_err(|e| gpu_error(e, &args.pack))?;
+    if !common.quiet {
+        let why = renderer.fallback.as_ref().map(|why| format!(" ({why})")).unwrap_or_default();
+        anstream::eprintln!("tracing with {}{why}", renderer.device());
+    }
+
+    let mode = args.mode.unwrap_or(if pack.grids[grid].record.class == GridClass::LevelSet as u32 {
+        Mode::Lit
+    } else {
+        Mode::Density
+    });
+    // One camera for all frames: around everything that any of them has.
+    let mut bounds = crate::volume::CoordBox::EMPTY;
+    frames.iter().for_each(|&f| bounds.union(pack.frame_tree(grid, f).bounds()));
+    let mut pictures = Vec::new();
+    let mut steps = 0.0;
+    for &frame in &frames {
+        let info = &pack.grids[grid];
+        let scene = Scene {
+            traversal: args.traversal,
+            ..Scene::new(info, &info.frames[frame], bounds, &args.camera, mode, args.size)
+        };
+        let image = renderer.render(grid, frame, &scene).map_err(|e| gpu_error(e, &args.pack))?;
+        steps += image.mean_steps() / frames.len() as f64;
+        pictures.push(image.to_rgb8(mode));
+    }
+    write(args, &pictures, pack.grids[grid].record.fps)?;
+    if !common.quiet {
+        let what = if frames.len() == 1 { "1 frame".to_owned() } else { format!("{} frames", frames.len()) };
+        let title = style::TITLE;
+        anstream::println!("{title}{}{title:#}: {what}, {steps:.1} steps a ray", args.output.display());
+    }
+    Ok(())
+}
+
+fn frames(args: &RenderArgs, pack: &Pack, grid: usize) -> Result<Vec<usize>> {
+    let all = &pack.grids[grid].frames;
+    let none = |what: String| Error::Usage(format!("{}: {what}", args.pack.display()));
+    match (args.frames, args.frame) {
+        (Some(Frames::All), _) => Ok((0..all.len()).collect()),
+        (None, None) if all.is_empty() => Err(none("it has no frames".to_owned())),
+        (None, None) => Ok(vec![0]),
+        (None, Some(number)) => {
+            let found = all.iter().position(|f| f.record.number == number);
+            let range = || match (all.first(), all.last()) {
+                (Some(a), Some(b)) => {
+                    format!("no frame {number}; it has {} to {}", a.record.number, b.record.number)
+                }
+                _ => "it has no frames".to_owned(),
+            };
+            Ok(vec![found.ok_or_else(|| none(range()))?])
+        }
+    }
+}
+
+fn write(args: &RenderArgs, pictures: &[Vec<u8>], fps: f32) -> Result<()> {
+    let failed = || Error::io(&args.output);
+    let folder = args.output.parent().filter(|f| *f != Path::new("")).unwrap_or(Path::new("."));
+    let file = tempfile::NamedTempFile::new_in(folder).map_err(failed())?;
+    let out = BufWriter::new(file.as_file());
+    match pictures {
+        [one] => write_png(out, args.size, one).map_err(failed())?,
+        _ if args.output.extension().is_some_and(|e| e == "apng") => {
+            let fps = if fps > 0.0 { fps.round() as u16 } else { 24 };
+            write_apng(out, args.size, pictures, fps).map_err(failed())?;
+        }
+        _ => {
+            let (size, sheet) = contact_sheet(args.size, pictures);
+            write_png(out, size, &sheet).map_err(failed())?;
+        }
+    }
+    persist(file, &args.output)
+}
+
+/// Moves a finished file to its place, readable by all as other outputs are.
+pub fn persist(file: tempfile::NamedTempFile<File>, path: &Path) -> Result<()> {
+    crate::pack::make_readable(file.as_file()).map_err(Error::io(path))?;
+    file.persist(path).map(drop).map_err(|e| Error::io(path)(e.error))
+}
+
+/// Frames left to right and top to bottom, in a sheet about as wide as it is high.
+fn contact_sheet([width, height]: [u32; 2], pictures: &[Vec<u8>]) -> ([u32; 2], Vec<u8>) {
+    let columns = (1..).find(|c| c * c >= pictures.len()).expect("some square is large enough");
+    let rows = pictures.len().div_ceil(columns);
+    let stride = width as usize * 3;
+    let mut sheet = vec![0; stride * columns * height as usize * rows];
+    for (i, picture) in pictures.iter().enumerate() {
+        for (y, row) in picture.chunks_exact(stride).enumerate() {
+            let at = ((i / columns * height as usize + y) * columns + i % columns) * stride;
+            sheet[at..at + stride].copy_from_slice(row);
+        }
+    }
+    ([width * columns as u32, height * rows as u32], sheet)
+}
+
+/// A GPU's failure as an error of the command.
+pub fn gpu_error(error: GpuError, pack: &Path) -> Error {
+    match error {
+        GpuError::Pack(source) => Error::Pack { path: pack.to_owned(), source },
+        GpuError::Failed(_) => Error::Other(error.to_string()),
+        other => Error::Unsupported(other.to_string()),
+    }
+}

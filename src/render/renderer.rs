@@ -1,0 +1,76 @@
+//! Chooses between the tracers.
+
+use clap::ValueEnum;
+
+use super::cpu::{Scene, trace};
+use super::field::Field;
+use super::gpu::{Gpu, GpuError, Uploaded};
+use super::image::Image;
+use crate::pack::{Pack, PackError};
+
+/// What traces a picture.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+pub enum Device {
+    /// A GPU or software Vulkan where one answers, else the CPU
+    #[default]
+    Auto,
+    /// A GPU or software Vulkan
+    Gpu,
+    /// The CPU tracer
+    Cpu,
+}
+
+/// Traces frames of one pack.
+pub struct Renderer<'a> {
+    pack: &'a Pack,
+    gpu: Option<(&'static Gpu, Uploaded)>,
+    /// Why it is the CPU though a GPU would have been welcome.
+    pub fallback: Option<String>,
+}
+
+impl<'a> Renderer<'a> {
+    /// Opens a device and uploads the pack to it.
+    ///
+    /// # Errors
+    /// With [`Device::Gpu`], when there is none or it cannot hold the pack.
+    pub fn new(pack: &'a Pack, device: Device) -> Result<Self, GpuError> {
+        if device == Device::Cpu {
+            return Ok(Self { pack, gpu: None, fallback: None });
+        }
+        let opened = Gpu::shared().and_then(|gpu| {
+            let uploaded = gpu.upload(pack)?;
+            Ok((gpu, uploaded))
+        });
+        match opened {
+            Ok(gpu) => Ok(Self { pack, gpu: Some(gpu), fallback: None }),
+            Err(GpuError::Pack(e)) => Err(GpuError::Pack(e)),
+            Err(e) if device == Device::Auto => Ok(Self { pack, gpu: None, fallback: Some(e.to_string()) }),
+            Err(e) => Err(e),
+        }
+    }
+
+    /// The name of what traces.
+    pub fn device(&self) -> &str {
+        self.gpu.as_ref().map_or("CPU tracer", |(gpu, _)| &gpu.name)
+    }
+
+    /// Whether it is a GPU, or software that stands for one.
+    pub fn is_gpu(&self) -> bool {
+        self.gpu.is_some()
+    }
+
+    /// Traces a frame of a grid.
+    ///
+    /// # Errors
+    /// When a chunk of the pack is damaged or the device fails.
+    pub fn render(&self, grid: usize, frame: usize, scene: &Scene) -> Result<Image, GpuError> {
+        let reader = self.pack.frame(grid, frame)?;
+        match &self.gpu {
+            Some((gpu, uploaded)) => gpu.trace(uploaded, [grid as u32, frame as u32], reader.bounds(), scene),
+            None => {
+                let field = Field::from_pack(&reader).map_err(|e: PackError| GpuError::Pack(e))?;
+                trace::<f32>(&field, scene).ok_or(GpuError::Transform)
+            }
+        }
+    }
+}
