@@ -181,7 +181,7 @@ impl Gpu {
         let lacks = |what: String| GpuError::Lacks { adapter: self.name.clone(), what };
         let limits = self.device.limits();
         let tree_bytes = pack.tree.len() as u64 * 4;
-        let most = u64::from(limits.max_storage_buffer_binding_size).min(limits.max_buffer_size);
+        let most = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
         if tree_bytes > most {
             return Err(lacks(format!("binds storage of {most} bytes, the pack's tree has {tree_bytes}")));
         }
@@ -285,7 +285,7 @@ impl Gpu {
     ) -> Result<(Image, Vec<f64>), GpuError> {
         let [width, height] = scene.size;
         let bytes = u64::from(width) * u64::from(height) * 16;
-        if bytes > u64::from(self.device.limits().max_storage_buffer_binding_size) {
+        if bytes > self.device.limits().max_storage_buffer_binding_size {
             return Err(GpuError::Lacks {
                 adapter: self.name.clone(),
                 what: format!("cannot write a picture of {width} × {height}"),

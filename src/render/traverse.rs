@@ -197,12 +197,12 @@ impl<F: Real> Walk<F> {
     pub fn enter(ray: &Ray<F>, bounds: Box3) -> Option<Self> {
         let start = ray.origin.map(|o| o.floor_i32().clamp(-MAX_CELL, MAX_CELL));
         let mut event: Option<Crossing<F>> = None;
-        for a in 0..3 {
-            let plane = if start[a] < bounds.min[a] && ray.forward(a) {
+        for (a, cell) in start.into_iter().enumerate() {
+            let plane = if cell < bounds.min[a] && ray.forward(a) {
                 bounds.min[a]
-            } else if start[a] >= bounds.max[a] && !ray.forward(a) {
+            } else if cell >= bounds.max[a] && !ray.forward(a) {
                 bounds.max[a]
-            } else if start[a] >= bounds.min[a] && start[a] < bounds.max[a] {
+            } else if cell >= bounds.min[a] && cell < bounds.max[a] {
                 continue;
             } else {
                 return None;
