@@ -1,11 +1,19 @@
 //! The tracers against each other: the shader, its twin in `f32`, and the reference in `f64`.
 
 mod common;
+#[path = "../fuzz/common/reseal.rs"]
+mod reseal;
+
+use std::io::BufReader;
+use std::path::Path;
 
 use common::{animation, build_verified, fixture};
 use volpack::pack::Pack;
+use volpack::pack::layout::{Section, kind};
 use volpack::render::gpu::Gpu;
-use volpack::render::{Field, Image, Mode, Scene, Traversal, View, trace};
+use volpack::render::{
+    Device, Field, Image, Mode, Renderer, Scene, Traversal, View, difference, trace, write_png,
+};
 use volpack::settings::{Format, Settings};
 
 const SIZE: [u32; 2] = [72, 56];
@@ -130,6 +138,74 @@ fn the_shader_sees_what_the_cpu_sees() {
                     );
                 }
             }
+        }
+    }
+}
+
+/// The pictures of fixtures, kept: a change that is meant is blessed with `VOLPACK_BLESS=1`.
+#[test]
+fn pictures_look_as_they_did() {
+    let folder = tempfile::tempdir().unwrap();
+    for (name, frames, grid) in cases() {
+        let settings = Settings { grids: vec![grid.to_owned()], format: Format::F16, ..Settings::default() };
+        let (pack, _) = build_verified(&frames, settings, folder.path());
+        let frame = pack.grids[0].frames.len() - 1;
+        let renderer = Renderer::new(&pack, Device::Auto).unwrap();
+        let bounds = pack.frame_tree(0, frame).bounds();
+        let mode = if name == "ball" { Mode::Lit } else { Mode::Density };
+        let (grid, size) = (&pack.grids[0], [96, 96]);
+        let scene = Scene::new(grid, &grid.frames[frame], bounds, &View::default(), mode, size);
+        let picture = renderer.render(0, frame, &scene).unwrap().to_rgb8(mode);
+
+        let golden = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/golden/{name}.png"));
+        if std::env::var_os("VOLPACK_BLESS").is_some() {
+            write_png(std::fs::File::create(&golden).unwrap(), size, &picture).unwrap();
+        }
+        let decoder = png::Decoder::new(BufReader::new(std::fs::File::open(&golden).unwrap()));
+        let mut reader = decoder.read_info().unwrap();
+        let mut kept = vec![0; reader.output_buffer_size().unwrap()];
+        reader.next_frame(&mut kept).unwrap();
+        let apart = difference(size, &kept, &picture);
+        assert!(apart.flip < 0.005, "{name}: FLIP {}", apart.flip);
+    }
+}
+
+/// Blocks of every mode, which an encoder that is asked for speed never makes: the texture unit must
+/// decode them as bcdec_rs does.
+#[test]
+fn the_gpu_decodes_any_bc7_block_as_the_cpu_does() {
+    let Ok(gpu) = Gpu::shared() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let settings = Settings { format: Format::Bc7, zstd: 0, ..Settings::default() };
+    build_verified(&[fixture("fog_half_zip.vdb")], settings, folder.path());
+    let mut bytes = std::fs::read(folder.path().join("test.volpack")).unwrap();
+    let sections = bytes[64..].chunks_exact(80).map(bytemuck::pod_read_unaligned::<Section>);
+    let texels = sections.take(8).find(|s| s.kind == kind::TEXELS).unwrap();
+    let mut state = 0x9e37_79b9_7f4a_7c15u64;
+    for (i, block) in
+        bytes[texels.offset as usize..][..texels.raw_bytes as usize].chunks_exact_mut(16).enumerate()
+    {
+        for byte in block.iter_mut() {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            *byte = (state >> 56) as u8;
+        }
+        // The lowest bit that is on is the block's mode, 0 to 7.
+        let mode = i % 8;
+        block[0] = (block[0] >> mode | 1) << mode;
+    }
+    reseal::reseal(&mut bytes);
+    let pack = Pack::from_bytes(bytes).unwrap();
+    let uploaded = gpu.upload(&pack).unwrap();
+    let field = Field::from_pack(&pack.frame(0, 0).unwrap()).unwrap();
+    for mode in [Mode::Density, Mode::First] {
+        for view in ["orbit:40,20,0.8", "orbit:200,-35,0.8"] {
+            let grid = &pack.grids[0];
+            let scene =
+                Scene::new(grid, &grid.frames[0], field.bounds, &view.parse().unwrap(), mode, [160, 160]);
+            let ours = gpu.trace(&uploaded, [0, 0], field.bounds, &scene).unwrap();
+            let twin = trace::<f32>(&field, &scene).unwrap();
+            let (n, most) = differing(&twin, &ours, 0..4, 1e-5);
+            assert_eq!(n, 0, "{mode:?} {view}: {most}");
         }
     }
 }

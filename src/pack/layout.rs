@@ -164,8 +164,9 @@ pub struct FrameRecord {
     pub chunks: u32,
     /// The active voxels' box: minimum, then maximum, inclusive. Empty if a minimum is above.
     pub bbox: [i32; 6],
-    /// Zero.
-    pub reserved: u32,
+    /// What encoding cost: the root of the sum of squared errors over every voxel of the frame that a
+    /// texel gives.
+    pub error_norm: f32,
     /// Leaves of the source's tree.
     pub leaves: u64,
     /// Active voxels of the source, tiles in full.

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use super::allocate::Allocation;
 use super::dedup::{Payload, SequenceTree, carried};
 use super::relayout;
-use crate::codec::{OutOfRange, Texels, encode};
+use crate::codec::{Codec, OutOfRange, Texels, decode, encode};
 use crate::pack::Atlas;
 use crate::volume::{Brick, InactiveRule};
 
@@ -41,6 +41,15 @@ pub enum QuantiseError {
     },
 }
 
+/// What became of each brick of a grid.
+#[derive(Default)]
+pub struct Outcome {
+    /// Its packing axis.
+    pub axes: Vec<u8>,
+    /// The squared error over the voxels that its texels give, on the decoded value.
+    pub squares: Vec<f64>,
+}
+
 /// The bricks of one slab that come from one grid.
 struct Part {
     grid: usize,
@@ -49,7 +58,7 @@ struct Part {
 }
 
 /// Encodes every slab of `atlas` in order. `finish` is applied to a slab's bytes on the thread that made
-/// them, `sink` to the results in order. Returns the packing axis of each brick by grid.
+/// them, `sink` to the results in order. Returns what became of each grid's bricks.
 ///
 /// # Errors
 /// [`QuantiseError`].
@@ -58,9 +67,9 @@ pub fn quantise<T: Send>(
     grids: &mut [GridBricks],
     finish: impl Fn(Vec<u8>) -> io::Result<T> + Sync,
     mut sink: impl FnMut(T) -> io::Result<()>,
-) -> Result<Vec<Vec<u8>>, QuantiseError> {
+) -> Result<Vec<Outcome>, QuantiseError> {
     let rules: Vec<Vec<InactiveRule>> = grids.iter().map(|g| brick_rules(g.tree)).collect();
-    let mut axes: Vec<Vec<u8>> = vec![Vec::new(); grids.len()];
+    let mut outcomes: Vec<Outcome> = grids.iter().map(|_| Outcome::default()).collect();
     let group = (BRICKS_IN_FLIGHT / atlas.slab_bricks()).max(1);
     for first in (0..atlas.slabs).step_by(group as usize) {
         let slabs = first..(first + group).min(atlas.slabs);
@@ -69,18 +78,19 @@ pub fn quantise<T: Send>(
         let encoded: Vec<_> = parts
             .into_par_iter()
             .map(|parts| {
-                let (bytes, axes) = encode_slab(atlas, grids, &rules, parts)?;
-                Ok((finish(relayout::assemble(atlas, &bytes))?, axes))
+                let (bytes, outcomes) = encode_slab(atlas, grids, &rules, parts)?;
+                Ok((finish(relayout::assemble(atlas, &bytes))?, outcomes))
             })
             .collect::<Result<_, QuantiseError>>()?;
-        for (slab, slab_axes) in encoded {
+        for (slab, parts) in encoded {
             sink(slab)?;
-            for (grid, part) in slab_axes {
-                axes[grid].extend(part);
+            for (grid, part) in parts {
+                outcomes[grid].axes.extend(part.axes);
+                outcomes[grid].squares.extend(part.squares);
             }
         }
     }
-    Ok(axes)
+    Ok(outcomes)
 }
 
 /// The inactive rule of each brick of the pool.
@@ -104,16 +114,16 @@ fn read_parts(grids: &mut [GridBricks], slots: Range<u32>) -> io::Result<Vec<Par
     Ok(parts)
 }
 
-type PartAxes = Vec<(usize, Vec<u8>)>;
+type PartOutcomes = Vec<(usize, Outcome)>;
 
 fn encode_slab(
     atlas: &Atlas,
     grids: &[GridBricks],
     rules: &[Vec<InactiveRule>],
     parts: Vec<Part>,
-) -> Result<(Vec<u8>, PartAxes), QuantiseError> {
+) -> Result<(Vec<u8>, PartOutcomes), QuantiseError> {
     let mut bytes = Vec::with_capacity(atlas.slab_bytes());
-    let mut axes = Vec::new();
+    let mut outcomes = Vec::new();
     for Part { grid, first, bricks } in parts {
         let source = &grids[grid];
         let texels: Vec<Texels> = bricks
@@ -127,8 +137,19 @@ fn encode_slab(
             .collect();
         let encoded = encode(atlas.codec, &source.allocation.sequence, &texels)
             .map_err(|source| QuantiseError::OutOfRange { grid, source })?;
+        let size = atlas.codec.layout().brick_bytes();
+        let each = bricks.iter().zip(&texels).zip(encoded.bytes.chunks_exact(size)).zip(&encoded.axes);
+        let squares = each.map(|(((brick, texels), bytes), &axis)| {
+            if atlas.codec == Codec::F32 {
+                return 0.0;
+            }
+            let decoded = decode(atlas.codec, bytes, axis, &source.allocation.sequence, texels.range);
+            let square = |i: usize| (f64::from(decoded[i]) - f64::from(brick.values[i])).powi(2);
+            texels.carried.ones().map(square).sum()
+        });
+        let squares = squares.collect();
         bytes.extend(encoded.bytes);
-        axes.push((grid, encoded.axes));
+        outcomes.push((grid, Outcome { axes: encoded.axes, squares }));
     }
-    Ok((bytes, axes))
+    Ok((bytes, outcomes))
 }

@@ -48,6 +48,8 @@ pub(super) struct FrameError {
     pub all: Error,
     /// The range of the source's active values, tiles included.
     pub active_range: Option<ValueRange>,
+    /// Squared error over the voxels that texels give.
+    texel_squares: f64,
     failures: u64,
     first_failure: Option<String>,
 }
@@ -61,6 +63,7 @@ impl FrameError {
     fn add(&mut self, other: Self) {
         self.active.add(&other.active);
         self.all.add(&other.all);
+        self.texel_squares += other.texel_squares;
         self.active_range = ValueRange::union_all(self.active_range.into_iter().chain(other.active_range));
         self.failures += other.failures;
         self.first_failure = self.first_failure.take().or(other.first_failure);
@@ -109,8 +112,13 @@ pub(super) fn compare<T: Scalar>(
     // Summed leaf by leaf in a fixed order, so that figures do not depend on threads.
     let leaves: Vec<FrameError> = (0..tree.leaves.len()).into_par_iter().map(|leaf| c.leaf(leaf)).collect();
     leaves.into_iter().for_each(|leaf| error.add(leaf));
+    c.check_error_norm(&mut error);
     error
 }
+
+/// How far the error that is measured may be from the one that the encoder left in the frame table: both
+/// are sums of the same squares, and one is rounded to f32.
+const NORM_TOLERANCE: f64 = 1e-6;
 
 impl<T: Scalar> Comparison<'_, T> {
     /// The source's value as the pack should have it.
@@ -193,6 +201,15 @@ impl<T: Scalar> Comparison<'_, T> {
         });
     }
 
+    /// The encoder's error is known to the last bit, so texels that were changed later give themselves
+    /// away, also in block formats, whose own promise is loose.
+    fn check_error_norm(&self, error: &mut FrameError) {
+        let (ours, theirs) = (error.texel_squares.sqrt(), f64::from(self.reader.frame().record.error_norm));
+        if (ours - theirs).abs() > NORM_TOLERANCE * ours.max(theirs) {
+            error.fail(|| format!("the texels' error is {ours:e}, the encoder left {theirs:e}"));
+        }
+    }
+
     fn leaf(&self, leaf: usize) -> FrameError {
         let mut error = FrameError::default();
         let origin = self.tree.leaves.origins[leaf];
@@ -225,6 +242,9 @@ impl<T: Scalar> Comparison<'_, T> {
             let difference = f64::from(ours) - f64::from(theirs);
             let flipped = self.sign_matters.is_some() && (ours < 0.0) != (theirs < 0.0);
             error.all.voxel(difference, flipped);
+            if contract.is_texel(mask.get(i)) {
+                error.texel_squares += difference * difference;
+            }
             if mask.get(i) {
                 error.active.voxel(difference, flipped);
             }
@@ -245,6 +265,8 @@ struct Contract {
     keeps_mask: bool,
     /// Whether inactive voxels come from a rule and must be exact.
     exact_inactive: bool,
+    /// Whether there are texels.
+    has_texels: bool,
     /// How far a voxel's value may be off.
     values: Bound,
 }
@@ -261,7 +283,7 @@ enum Bound {
 impl Contract {
     fn of(region: &Region, reader: &FrameReader) -> Self {
         let Region::Brick(record) = region else {
-            return Self { keeps_mask: true, exact_inactive: true, values: Bound::Exact };
+            return Self { keeps_mask: true, exact_inactive: true, has_texels: false, values: Bound::Exact };
         };
         let span = f64::from(reader.grid().sequence.span);
         let extent = BrickRange::from_word(record.word2).extent.to_f64() * span;
@@ -278,8 +300,14 @@ impl Contract {
         Self {
             keeps_mask: record.mask.is_some(),
             exact_inactive: record.mask.is_some() && record.rule != InactiveRule::Texel,
+            has_texels: record.codec != Codec::Constant,
             values,
         }
+    }
+
+    /// Whether a voxel's value comes from a texel.
+    fn is_texel(&self, active: bool) -> bool {
+        self.has_texels && (active || !self.exact_inactive)
     }
 
     fn allows(&self, ours: f32, theirs: f32, active: bool) -> bool {

@@ -8,7 +8,7 @@ use std::path::Path;
 
 use super::allocate::Allocation;
 use super::dedup::{CellRef, FrameTree, Payload, SequenceTree};
-use super::quantise::{GridBricks, QuantiseError, quantise};
+use super::quantise::{GridBricks, Outcome, QuantiseError, quantise};
 use super::relayout;
 use crate::codec::Codec;
 use crate::pack::layout::{AtlasRecord, CHUNK_BYTES, FrameRecord, GridRecord, encoding, kind};
@@ -116,7 +116,6 @@ pub fn serialise(
     };
     let mut specs = vec![
         spec(kind::GRIDS, encoding::RAW, grids.len() * size_of::<GridRecord>()),
-        spec(kind::FRAMES, plain, frame_count * size_of::<FrameRecord>()),
         spec(kind::NAMES, encoding::RAW, names.len()),
         spec(kind::ATLASES, encoding::RAW, if atlas.bricks > 0 { size_of::<AtlasRecord>() } else { 0 }),
         spec(kind::FRAME_CHUNKS, plain, list_len * 4),
@@ -132,13 +131,13 @@ pub fn serialise(
             raw_bytes: atlas.bytes(),
         });
     }
-    // The tree comes last: its records hold the packing axes, which encoding chooses.
+    // Frames and tree come last: they hold what encoding cost, and the packing axes that it chose.
+    specs.push(spec(kind::FRAMES, plain, frame_count * size_of::<FrameRecord>()));
     specs.push(spec(kind::TREE, plain, words.words.len() * 4));
 
-    let (frames, lists) = frame_tables(grids, &slabs, chunks_before as u32);
+    let (mut frames, lists) = frame_tables(grids, &slabs, chunks_before as u32);
     let mut writer = PackWriter::create(path, specs)?;
     writer.section(bytemuck::cast_slice(&grid_records(grids)), level)?;
-    writer.section(bytemuck::cast_slice(&frames), level)?;
     writer.section(names.as_bytes(), level)?;
     if atlas.bricks > 0 {
         writer.section(bytemuck::bytes_of(&atlas_record(&atlas)), level)?;
@@ -155,7 +154,7 @@ pub fn serialise(
             .zip(&first_slots)
             .map(|(g, &first_slot)| GridBricks { tree: &mut g.tree, allocation: &g.allocation, first_slot })
             .collect();
-        let axes = quantise(
+        let outcomes = quantise(
             &atlas,
             &mut sources,
             |slab| compress_chunk(slab, texel_encoding, level),
@@ -164,8 +163,10 @@ pub fn serialise(
                 writer.chunk(&chunk)
             },
         )?;
-        words.set_axes(grids, &axes);
+        words.set_axes(grids, &outcomes);
+        set_errors(&mut frames, grids, &outcomes);
     }
+    writer.section(bytemuck::cast_slice(&frames), level)?;
     writer.section(bytemuck::cast_slice(&words.words), level)?;
     Ok(writer.finish()?)
 }
@@ -202,22 +203,35 @@ fn grid_records(grids: &[GridInput]) -> Vec<GridRecord> {
         .collect()
 }
 
+/// The bricks of the pool that a frame uses, shared ones each time.
+fn frame_bricks<'a>(tree: &'a SequenceTree, frame: &'a FrameTree) -> impl Iterator<Item = u32> + 'a {
+    let nodes = frame.cells.iter().filter_map(|(_, content)| match content {
+        CellRef::Node(node) => Some(&tree.nodes.items()[*node as usize]),
+        CellRef::Constant(_) => None,
+    });
+    let records = nodes.flat_map(|node| node.entries(&tree.runs)).map(|&r| &tree.records[r as usize]);
+    records.filter_map(|record| match record.payload {
+        Payload::Brick(id) => Some(id),
+        Payload::Constant(_) => None,
+    })
+}
+
 /// The slabs that each frame's bricks lie in, ascending.
 fn frame_slabs(grid: &GridInput, atlas: &Atlas, first_slot: u32) -> Vec<Vec<u32>> {
-    let tree = &grid.tree;
-    let frame = |frame: &FrameTree| {
-        let nodes = frame.cells.iter().filter_map(|(_, content)| match content {
-            CellRef::Node(node) => Some(&tree.nodes.items()[*node as usize]),
-            CellRef::Constant(_) => None,
-        });
-        let records = nodes.flat_map(|node| node.entries(&tree.runs)).map(|&r| &tree.records[r as usize]);
-        let slabs = records.filter_map(|record| match record.payload {
-            Payload::Brick(id) => Some((first_slot + id) / atlas.slab_bricks()),
-            Payload::Constant(_) => None,
-        });
-        slabs.collect::<BTreeSet<u32>>().into_iter().collect()
-    };
-    tree.frames.iter().map(frame).collect()
+    let slabs = |frame| frame_bricks(&grid.tree, frame).map(|id| (first_slot + id) / atlas.slab_bricks());
+    let sorted = |frame| slabs(frame).collect::<BTreeSet<u32>>().into_iter().collect();
+    grid.tree.frames.iter().map(sorted).collect()
+}
+
+/// Fills in what encoding cost each frame.
+fn set_errors(frames: &mut [FrameRecord], grids: &[GridInput], outcomes: &[Outcome]) {
+    let mut frames = frames.iter_mut();
+    for (grid, outcome) in grids.iter().zip(outcomes) {
+        for (tree, frame) in grid.tree.frames.iter().zip(&mut frames) {
+            let squares: f64 = frame_bricks(&grid.tree, tree).map(|id| outcome.squares[id as usize]).sum();
+            frame.error_norm = squares.sqrt() as f32;
+        }
+    }
 }
 
 fn frame_tables(
@@ -236,7 +250,7 @@ fn frame_tables(
                 first_chunk: lists.len() as u32,
                 chunks: slabs.len() as u32,
                 bbox: frame.stats.bbox.to_array(),
-                reserved: 0,
+                error_norm: 0.0,
                 leaves: frame.stats.leaves,
                 active_voxels: frame.stats.active_voxels,
                 transform: input.transform,

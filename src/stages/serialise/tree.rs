@@ -9,6 +9,7 @@ use crate::pack::tree::{
     self, GRID_WORDS, HEADER_WORDS, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS,
 };
 use crate::stages::dedup::{CellRef, FrameTree, Payload, SequenceTree};
+use crate::stages::quantise::Outcome;
 use crate::volume::{CELL_DIM, Constant, Coord, Interner, ROOT_DIM};
 
 /// L1 nodes a frame may have room for: 4 MB of links. A box of 100 of them an axis is 400,000 voxels
@@ -174,13 +175,13 @@ impl TreeWords {
         Self { words, record_at }
     }
 
-    /// Fills in the packing axes, by grid and brick.
-    pub fn set_axes(&mut self, grids: &[GridInput], axes: &[Vec<u8>]) {
+    /// Fills in the packing axes.
+    pub fn set_axes(&mut self, grids: &[GridInput], outcomes: &[Outcome]) {
         let mut at = self.record_at;
-        for (grid, axes) in grids.iter().zip(axes) {
+        for (grid, outcome) in grids.iter().zip(outcomes) {
             for &record in grid.tree.runs.items() {
                 if let Payload::Brick(id) = grid.tree.records[record as usize].payload {
-                    self.words[at] |= u32::from(axes[id as usize]) << 3;
+                    self.words[at] |= u32::from(outcome.axes[id as usize]) << 3;
                 }
                 at += RECORD_WORDS;
             }

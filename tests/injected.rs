@@ -1,0 +1,156 @@
+//! Faults that digests cannot tell, because whoever made them made the digests too: verification has to.
+
+mod common;
+#[path = "../fuzz/common/reseal.rs"]
+mod reseal;
+
+use std::path::{Path, PathBuf};
+
+use common::{build_verified, fixture};
+use reseal::reseal;
+use volpack::codec::Codec;
+use volpack::pack::layout::{Header, Section, kind};
+use volpack::pack::tree::{NODE_WORDS, RECORD_WORDS, header};
+use volpack::pack::{Pack, Region};
+use volpack::settings::{Format, Settings};
+use volpack::verify::{Sources, voxels};
+
+/// A pack in memory whose sections lie in it as they are.
+struct Victim {
+    bytes: Vec<u8>,
+    source: PathBuf,
+}
+
+impl Victim {
+    fn new(name: &str, grid: &str, format: Format, folder: &Path) -> Self {
+        let settings = Settings { grids: vec![grid.to_owned()], format, zstd: 0, ..Settings::default() };
+        let source = fixture(name);
+        let (_, report) = build_verified(std::slice::from_ref(&source), settings, folder);
+        assert!(report.ok);
+        let victim = Self { bytes: std::fs::read(folder.join("test.volpack")).unwrap(), source };
+        assert_eq!(victim.verdict(|_| {}), None, "resealing alone changes nothing");
+        victim
+    }
+
+    /// Where a section's bytes begin.
+    fn section(bytes: &[u8], wanted: u32) -> usize {
+        let header: Header = bytemuck::pod_read_unaligned(&bytes[..64]);
+        let sections = bytes[64..].chunks_exact(80).take(header.sections as usize);
+        let found = sections.map(bytemuck::pod_read_unaligned::<Section>).find(|s| s.kind == wanted);
+        found.unwrap().offset as usize
+    }
+
+    /// What is said of the pack after `damage`, with its digests made anew; `None` if it passes.
+    fn verdict(&self, damage: impl FnOnce(&mut [u8])) -> Option<String> {
+        let mut bytes = self.bytes.clone();
+        damage(&mut bytes);
+        reseal(&mut bytes);
+        let pack = match Pack::from_bytes(bytes) {
+            Ok(pack) => pack,
+            Err(e) => return Some(e.to_string()),
+        };
+        pack.check_chunks().expect("the digests are right");
+        let sources = Sources::find(&pack, std::slice::from_ref(&self.source)).unwrap();
+        let report = voxels(&pack, &sources, |_| {}).unwrap();
+        report.failures.first().cloned()
+    }
+
+    /// Changes words of the tree.
+    fn tree(&self, damage: impl FnOnce(&mut [u32])) -> Option<String> {
+        self.verdict(|bytes| {
+            let at = Self::section(bytes, kind::TREE);
+            let len = u32::from_le_bytes(bytes[at..at + 4].try_into().unwrap()) as usize;
+            let mut words: Vec<u32> = bytemuck::allocation::pod_collect_to_vec(&bytes[at..at + len * 4]);
+            damage(&mut words);
+            bytes[at..at + len * 4].copy_from_slice(bytemuck::cast_slice(&words));
+        })
+    }
+}
+
+/// The first words of the records that have texels.
+fn records(words: &[u32]) -> Vec<usize> {
+    let at = words[header::RECORD_AT] as usize;
+    let records = (0..words[header::RECORDS] as usize).map(|i| at + i * RECORD_WORDS);
+    records.filter(|&r| words[r] & 7 != Codec::Constant as u32).collect()
+}
+
+#[test]
+fn changed_texels_are_found_in_every_format() {
+    let folder = tempfile::tempdir().unwrap();
+    for format in Format::ALL {
+        let victim = Victim::new("fog_half_zip.vdb", "density", format, folder.path());
+        let before = values(&victim.bytes);
+        let mut changed = 0;
+        for place in (0..1600).step_by(67) {
+            let mut now = Vec::new();
+            let found = victim.verdict(|bytes| {
+                bytes[Victim::section(bytes, kind::TEXELS) + place] ^= 0x10;
+                let mut sealed = bytes.to_vec();
+                reseal(&mut sealed);
+                now = values(&sealed);
+            });
+            // An index of a block of one colour says nothing, and is no fault.
+            assert_eq!(found.is_some(), now != before, "{format:?} byte {place}");
+            changed += u32::from(now != before);
+        }
+        assert!(changed >= 4, "{format:?}: only {changed} of 24 changes changed a value");
+    }
+}
+
+/// Every value that a pack's bricks have.
+fn values(bytes: &[u8]) -> Vec<u32> {
+    let pack = Pack::from_bytes(bytes.to_vec()).unwrap();
+    let frame = pack.frame(0, 0).unwrap();
+    let mut values = Vec::new();
+    frame.for_each_region(|_, _, region| {
+        if let Region::Brick(record) = region {
+            values.extend(frame.decode(&record).unwrap().values.iter().map(|v| v.to_bits()));
+        }
+    });
+    values
+}
+
+#[test]
+fn swapped_bricks_wrong_axes_and_wrong_ranks_are_found() {
+    let folder = tempfile::tempdir().unwrap();
+    let victim = Victim::new("fog_half_zip.vdb", "density", Format::Bc7, folder.path());
+    let swapped = victim.tree(|words| {
+        let r = records(words);
+        let (a, b) = (words[r[3]], words[r[10]]);
+        words[r[3]] = a & 0x1f | b & !0x1f;
+        words[r[10]] = b & 0x1f | a & !0x1f;
+    });
+    assert!(swapped.unwrap().contains("error"), "a swapped slot");
+    let turned = victim.tree(|words| {
+        let r = records(words)[7];
+        let axis = (words[r] >> 3 & 3) + 1;
+        words[r] = words[r] & !(3 << 3) | axis % 3 << 3;
+    });
+    assert!(turned.is_some(), "a wrong axis");
+    let miscounted = victim.tree(|words| words[words[header::NODE_AT] as usize + 130] += 1);
+    assert!(miscounted.unwrap().contains("ranks"), "a wrong rank");
+    let moved = victim.tree(|words| {
+        let first = words[header::NODE_AT] as usize + NODE_WORDS - 1;
+        words[first] = words[first].wrapping_add(1);
+    });
+    assert!(moved.is_some(), "a node that begins a record late");
+}
+
+#[test]
+fn wrong_inactive_rules_and_masks_are_found() {
+    let folder = tempfile::tempdir().unwrap();
+    let victim = Victim::new("levelset_half.vdb", "surface", Format::Unorm8, folder.path());
+    let rule = victim.tree(|words| {
+        // From "background" to "minus background".
+        let r = records(words).into_iter().find(|r| words[r + 1] >> 30 == 0).unwrap();
+        words[r + 1] |= 1 << 30;
+    });
+    assert!(rule.is_some(), "a wrong rule");
+    let mask = victim.tree(|words| words[words[header::MASK_AT] as usize] ^= 1 << 9);
+    assert!(mask.is_some(), "a wrong mask");
+    let background = victim.tree(|words| {
+        let at = words[header::GRID_AT] as usize + 11;
+        words[at] = 0.25f32.to_bits();
+    });
+    assert!(background.unwrap().contains("background"), "a wrong background");
+}
