@@ -151,7 +151,10 @@ pub fn persist(file: tempfile::NamedTempFile<File>, path: &Path) -> Result<()> {
 
 /// Frames left to right and top to bottom, in a sheet about as wide as it is high.
 fn contact_sheet([width, height]: [u32; 2], pictures: &[Vec<u8>]) -> ([u32; 2], Vec<u8>) {
-    let columns = (1..).find(|c| c * c >= pictures.len()).expect("some square is large enough");
+    let square = (1..).find(|c| c * c >= pictures.len()).expect("some square is large enough");
+    // Up to half again as wide as high, if that leaves fewer places empty.
+    let empty = |columns: &usize| pictures.len().next_multiple_of(*columns) - pictures.len();
+    let columns = (square..=square * 3 / 2).min_by_key(empty).expect("the range has its first");
     let rows = pictures.len().div_ceil(columns);
     let stride = width as usize * 3;
     let mut sheet = vec![0; stride * columns * height as usize * rows];

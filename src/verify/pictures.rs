@@ -87,10 +87,9 @@ pub struct TracerDifference {
 fn default_max_flip(format: Format) -> f64 {
     match format {
         Format::F32 => 0.001,
-        Format::F16 => 0.002,
-        Format::Unorm8 => 0.005,
-        Format::Bc4 => 0.05,
-        Format::Bc7 => 0.10,
+        Format::F16 => 0.001,
+        Format::Unorm8 => 0.006,
+        Format::Bc4 | Format::Bc7 => 0.04,
     }
 }
 

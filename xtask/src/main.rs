@@ -7,6 +7,7 @@ mod formats;
 mod mutate;
 mod openvdb;
 mod peers;
+mod pictures;
 mod read;
 mod trace;
 
@@ -46,6 +47,8 @@ enum Bench {
     /// Every format and range on each volume: bytes, PSNR, largest error, seconds; and the tree beside
     /// the thesis's layout
     Formats(formats::Args),
+    /// What each format costs the eye: FLIP, PSNR and RMSE of pictures of pack and source
+    Pictures(pictures::Args),
     /// Milliseconds a frame on a GPU: every format, DDA and HDDA, at 1920 × 1080
     Trace(trace::Args),
 }
@@ -54,6 +57,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     match Cli::parse().task {
         Task::Bench(Bench::Read(args)) => read::bench(&args),
         Task::Bench(Bench::Formats(args)) => formats::bench(&args),
+        Task::Bench(Bench::Pictures(args)) => pictures::bench(&args),
         Task::Bench(Bench::Trace(args)) => trace::bench(&args),
         Task::CheckOpenvdb { files } => openvdb::check(&files),
         Task::Mutate(args) => mutate::run(args),

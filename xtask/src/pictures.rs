@@ -1,0 +1,61 @@
+//! What each format costs the eye: pictures of pack and source, by the CPU tracer.
+
+use std::error::Error;
+use std::path::{Path, PathBuf};
+
+use volpack::pack::Pack;
+use volpack::pipeline::{Job, Silent, VerifyLevel, build};
+use volpack::render::Device;
+use volpack::settings::{Format, Settings};
+use volpack::verify::{PictureSettings, Sources, pictures};
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// Sequences: a file or a glob each
+    #[arg(required = true)]
+    sequences: Vec<PathBuf>,
+    /// What traces the pack
+    #[arg(long, default_value = "cpu")]
+    device: Device,
+}
+
+/// Builds every format of each sequence and prints its worst picture.
+pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
+    let folder = tempfile::tempdir()?;
+    println!("| volume | format | FLIP | PSNR of the picture | RMSE of the picture |");
+    println!("|---|---|---|---|---|");
+    for sequence in &args.sequences {
+        let frames = volpack::manifest::expand(std::slice::from_ref(sequence))?;
+        // A sequence goes by its folder's name.
+        let named = if frames.len() == 1 {
+            sequence.file_stem()
+        } else {
+            sequence.parent().and_then(Path::file_name)
+        };
+        let name = named.unwrap_or_default().to_string_lossy();
+        for format in Format::ALL {
+            let job = Job {
+                frames: frames.clone(),
+                output: folder.path().join("bench.volpack"),
+                settings: Settings { format, ..Settings::default() },
+                strict: false,
+                verify: VerifyLevel::None,
+                pictures: PictureSettings::default(),
+            };
+            build(&job, &mut Silent)?;
+            let pack = Pack::open(&job.output)?;
+            let settings = PictureSettings { device: args.device, ..PictureSettings::default() };
+            let report = pictures(&pack, &Sources::find(&pack, &frames)?, &settings)?;
+            let worst = report.pictures.iter().max_by(|a, b| a.source.flip.total_cmp(&b.source.flip));
+            let worst = worst.ok_or("no pictures")?.source;
+            let psnr = worst.psnr.map_or("same".to_owned(), |db| format!("{db:.1} dB"));
+            println!(
+                "| {name} | {} | {:.4} | {psnr} | {:.5} |",
+                format.codec().name(),
+                worst.flip,
+                worst.rmse
+            );
+        }
+    }
+    Ok(())
+}
