@@ -89,7 +89,7 @@ fn inspect_gives_every_figure() {
     }
     assert_eq!(grid["bbox"].as_array().unwrap().len(), 6);
 
-    volpack(folder.path(), &["build", &animation_glob(), "-o", "a.volpack", "-f", "bc7"]);
+    volpack(folder.path(), &["build", &animation_glob(), "-o", "a.volpack", "-f", "bc7", "--verify", "none"]);
     let pack = json(&volpack(folder.path(), &["inspect", "--json", "a.volpack"]));
     for key in ["frames", "bricks", "unique_bricks", "tree_bytes", "mask_bytes", "texel_bytes", "file_bytes"]
     {
@@ -109,7 +109,18 @@ fn the_same_input_gives_the_same_bytes() {
     let (one, two) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     for format in ["f32", "bc4", "bc7"] {
         let build = |folder: &Path, threads: &str| {
-            let args = ["build", &animation_glob(), "-o", "a.volpack", "-f", format, "--threads", threads];
+            let args = [
+                "build",
+                &animation_glob(),
+                "-o",
+                "a.volpack",
+                "-f",
+                format,
+                "--threads",
+                threads,
+                "--verify",
+                "none",
+            ];
             stdout(&volpack(folder, &args));
             std::fs::read(folder.join("a.volpack")).unwrap()
         };
@@ -168,7 +179,7 @@ fn a_bad_frame_is_named_and_the_old_pack_stays() {
         let name = format!("anim_{n:04}.vdb");
         std::fs::copy(fixture(&name), folder.path().join(name)).unwrap();
     }
-    let build = || volpack(folder.path(), &["build", "anim_*.vdb", "-o", "a.volpack"]);
+    let build = || volpack(folder.path(), &["build", "anim_*.vdb", "-o", "a.volpack", "--verify", "voxels"]);
     stdout(&build());
     let before = std::fs::read(folder.path().join("a.volpack")).unwrap();
 
@@ -185,7 +196,7 @@ fn verify_tells_a_changed_source_and_a_damaged_pack() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();
     std::fs::copy(fixture("fog_half_zip.vdb"), at.join("fog.vdb")).unwrap();
-    stdout(&volpack(at, &["build", "fog.vdb", "-o", "a.volpack", "-f", "bc7"]));
+    stdout(&volpack(at, &["build", "fog.vdb", "-o", "a.volpack", "-f", "bc7", "--verify", "none"]));
     stdout(&volpack(at, &["verify", "a.volpack", "--source", "fog.vdb"]));
     stdout(&volpack(at, &["verify", "a.volpack", "--level", "structure"]));
     let (code, error) = failure(&volpack(at, &["verify", "a.volpack"]));
@@ -210,4 +221,47 @@ fn a_level_set_whose_sign_flips_fails() {
     let output = volpack(folder.path(), &[&["build", &fix("levelset_half.vdb")], &coarse[..]].concat());
     let (code, error) = failure(&output);
     assert!(code == 4 && error.contains("flipped"), "{code} {error}");
+}
+
+#[test]
+fn pictures_are_rendered_compared_and_kept() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let build = ["build", &animation_glob(), "-o", "a.volpack", "-f", "bc7", "--device", "cpu"];
+    let text = stdout(&volpack(at, &[&build[..], &["--images", "shown"]].concat()));
+    assert!(text.contains("by the CPU tracer alone") && text.contains("FLIP"), "{text}");
+    assert_eq!(
+        std::fs::read_dir(at.join("shown")).unwrap().count(),
+        3,
+        "the first, a middle and the last frame"
+    );
+
+    let (code, error) = failure(&volpack(at, &[&build[..], &["--max-flip", "0.0001"]].concat()));
+    assert!(code == 4 && error.contains("FLIP") && error.contains("max_flip"), "{code} {error}");
+
+    let render = |more: &[&str]| {
+        volpack(at, &[&["render", "a.volpack", "-o", "p.png", "--device", "cpu"], more].concat())
+    };
+    let size = || {
+        let bytes = std::fs::read(at.join("p.png")).unwrap();
+        assert!(bytes.starts_with(b"\x89PNG"));
+        [16, 20].map(|i| u32::from_be_bytes(bytes[i..i + 4].try_into().unwrap()))
+    };
+    for mode in ["density", "depth", "first", "bricks", "steps", "nodes", "normals", "lit"] {
+        assert!(
+            stdout(&render(&["--size", "48x32", "--frame", "3", "--mode", mode])).contains("steps a ray")
+        );
+        assert_eq!(size(), [48, 32]);
+    }
+    stdout(&render(&["--size", "48x32", "--frames", "all"]));
+    assert_eq!(size(), [4 * 48, 2 * 32]);
+    for (wrong, part) in [
+        (vec!["--frame", "77"], "it has 1 to 8"),
+        (vec!["--grid", "heat"], "it has density"),
+        (vec!["--camera", "orbit:1"], "orbit:AZIMUTH"),
+        (vec!["--size", "0x4"], "1920x1080"),
+    ] {
+        let (code, error) = failure(&render(&wrong));
+        assert!(code == 2 && error.contains(part), "{wrong:?}: {code} {error}");
+    }
 }
