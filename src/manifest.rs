@@ -54,7 +54,7 @@ struct RawAsset {
     nonfinite: NonFinite,
     zstd: Option<toml::Spanned<i32>>,
     fps: Option<toml::Spanned<f32>>,
-    max_flip: Option<f64>,
+    max_flip: Option<toml::Spanned<f64>>,
     output: Option<PathBuf>,
 }
 
@@ -117,6 +117,12 @@ impl RawAsset {
             }
             fps => fps.map(toml::Spanned::into_inner),
         };
+        let max_flip = match self.max_flip {
+            Some(flip) if !(flip.get_ref().is_finite() && *flip.get_ref() > 0.0) => {
+                return Err(at_line(text, flip.span().start, "max_flip is a number above 0"));
+            }
+            flip => flip.map(toml::Spanned::into_inner),
+        };
         let frames = match self.frames {
             OneOrMany::One(one) => vec![one],
             OneOrMany::Many(many) => many,
@@ -125,7 +131,7 @@ impl RawAsset {
         Ok(Asset {
             frames: frames.into_iter().map(|f| folder.join(f)).collect(),
             output: folder.join(output),
-            max_flip: self.max_flip,
+            max_flip,
             settings: Settings {
                 grids,
                 format: self.format,

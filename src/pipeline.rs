@@ -7,6 +7,7 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 use crate::pack::{Pack, Provenance, Source};
+use crate::report::PackSummary;
 use crate::settings::{Format, Masks, Settings};
 use crate::stages::allocate::allocate;
 use crate::stages::dedup::{DedupError, MaskPolicy, SequenceTree};
@@ -74,6 +75,8 @@ pub struct Outcome {
     pub warnings: Vec<String>,
     /// Seconds by stage, in order.
     pub seconds: Vec<(&'static str, f64)>,
+    /// What is in the pack.
+    pub summary: PackSummary,
     /// What verification found, if voxels were compared.
     pub verification: Option<VerifyReport>,
 }
@@ -81,9 +84,10 @@ pub struct Outcome {
 /// Builds one pack, and verifies it as the job asks.
 ///
 /// # Errors
-/// The first thing that is wrong, with its file and grid. Nothing is left at the output then but
-/// what was there before, unless only verification failed.
+/// The first thing that is wrong, with its file and grid. A report that is not ok is no error. In both
+/// cases the output is what it was before.
 pub fn build(job: &Job, progress: &mut dyn Progress) -> Result<Outcome> {
+    check_output(job)?;
     let mut clock = Clock::new();
     progress.stage("metadata", job.frames.len() as u64, "files");
     let sequence = metadata::read(&job.frames)?;
@@ -111,24 +115,52 @@ pub fn build(job: &Job, progress: &mut dyn Progress) -> Result<Outcome> {
     let bricks: u64 = grids.iter().map(|g| u64::from(g.tree.pool.len())).sum();
     progress.stage("encode", bricks, "bricks");
     let level = (job.settings.zstd != 0).then_some(job.settings.zstd);
-    serialise(&job.output, &mut grids, &provenance, level, |bricks| progress.advance(bricks))
+    let finished = serialise(&job.output, &mut grids, &provenance, level, |bricks| progress.advance(bricks))
         .map_err(|e| serialise_error(e, &grids, &job.output))?;
     clock.lap("encode and serialise");
 
     let verification = match job.verify {
         VerifyLevel::None => None,
         VerifyLevel::Structure => {
-            check_structure(&job.output)?;
+            check_structure(finished.path())?;
             None
         }
         VerifyLevel::Voxels | VerifyLevel::All => {
-            let pack = check_structure(&job.output)?;
+            let pack = check_structure(finished.path())?;
             let pictures = (job.verify == VerifyLevel::All).then_some(&job.pictures);
             Some(verify_against(&pack, &job.frames, pictures, progress)?)
         }
     };
     clock.lap("verify");
-    Ok(Outcome { warnings, seconds: clock.laps, verification })
+    let pack = Pack::open(finished.path()).map_err(Error::pack(finished.path()))?;
+    let summary = PackSummary::new(&pack);
+    drop(pack);
+    if verification.as_ref().is_none_or(|report| report.ok) {
+        finished.persist().map_err(Error::io(&job.output))?;
+    }
+    Ok(Outcome { warnings, seconds: clock.laps, summary, verification })
+}
+
+/// A slip in the arguments must not cost anyone a source file.
+fn check_output(job: &Job) -> Result<()> {
+    let Ok(output) = job.output.canonicalize() else { return Ok(()) };
+    if job.frames.iter().any(|f| f.canonicalize().is_ok_and(|f| f == output)) {
+        return Err(Error::Usage(format!(
+            "{} is a source of the pack and its output too",
+            job.output.display()
+        )));
+    }
+    let mut magic = [0; 8];
+    let is_pack =
+        std::fs::File::open(&output).and_then(|mut f| std::io::Read::read_exact(&mut f, &mut magic)).is_ok()
+            && magic == crate::pack::layout::MAGIC;
+    if !is_pack {
+        return Err(Error::Usage(format!(
+            "{} exists and is not a pack: delete it, or choose another output",
+            job.output.display()
+        )));
+    }
+    Ok(())
 }
 
 /// Compares a pack's voxels, and pictures where settings for them are given, with its sources.

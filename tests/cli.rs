@@ -265,3 +265,50 @@ fn pictures_are_rendered_compared_and_kept() {
         assert!(code == 2 && error.contains(part), "{wrong:?}: {code} {error}");
     }
 }
+
+#[test]
+fn a_slip_in_the_arguments_costs_no_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    std::fs::copy(fixture("levelset_half.vdb"), at.join("a.vdb")).unwrap();
+    std::fs::copy(fixture("levelset_float.vdb"), at.join("b.vdb")).unwrap();
+    let before = std::fs::read(at.join("b.vdb")).unwrap();
+    for (output, part) in [("a.vdb", "output too"), ("b.vdb", "is not a pack")] {
+        let (code, error) = failure(&volpack(at, &["build", "a.vdb", "-o", output]));
+        assert!(code == 2 && error.contains(part), "{code} {error}");
+    }
+    assert_eq!(std::fs::read(at.join("b.vdb")).unwrap(), before);
+
+    // A pack that fails verification does not take the place of one that passed.
+    stdout(&volpack(at, &["build", "a.vdb", "-o", "a.volpack", "--verify", "voxels"]));
+    let good = std::fs::read(at.join("a.volpack")).unwrap();
+    let coarse =
+        ["build", "a.vdb", "-o", "a.volpack", "-f", "bc4", "-r", "sequence", "--verify", "voxels", "--json"];
+    let output = volpack(at, &coarse);
+    assert_eq!(output.status.code(), Some(4));
+    assert_eq!(std::fs::read(at.join("a.volpack")).unwrap(), good);
+    let report: Json = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(report["assets"][0]["verification"]["ok"], false);
+    assert!(report["assets"][0]["error"].as_str().unwrap().contains("flipped"));
+
+    let (code, error) = failure(&volpack(at, &["render", "a.volpack", "-o", "a.volpack", "--device", "cpu"]));
+    assert!(code == 2 && error.contains("the picture too"), "{code} {error}");
+
+    for (manifest, args, expected, part) in [
+        ("[asset.a]\nframes = []\n", vec!["build"], 3, "no frames"),
+        ("[asset.a]\nframes = 'a.vdb'\n", vec!["build", "-f", "bc7"], 2, "FILES"),
+        ("[asset.a]\nframes = 'a.vdb'\nmax_flip = nan\n", vec!["build"], 3, "max_flip"),
+        ("[asset.a]\nframes = 'no*.vdb'\n[asset.b]\nframes = 'b.vdb'\n", vec!["build"], 3, "no file matches"),
+        (
+            "[asset.a]\nframes = 'a.vdb'\noutput = 'x'\n[asset.b]\nframes = 'b.vdb'\noutput = 'x'\n",
+            vec!["build"],
+            2,
+            "both",
+        ),
+    ] {
+        std::fs::write(at.join("pipeline.toml"), manifest).unwrap();
+        let (code, error) = failure(&volpack(at, &[&args[..], &["--device", "cpu"]].concat()));
+        assert!(code == expected && error.contains(part), "{manifest}: {code} {error}");
+    }
+    assert!(at.join("b.volpack").exists(), "the asset after a bad one is built");
+}

@@ -124,7 +124,7 @@ fn swapped_bricks_wrong_axes_and_wrong_ranks_are_found() {
     let turned = victim.tree(|words| {
         let r = records(words)[7];
         let axis = (words[r] >> 3 & 3) + 1;
-        words[r] = words[r] & !(3 << 3) | axis % 3 << 3;
+        words[r] = (words[r] & !(3 << 3)) | ((axis % 3) << 3);
     });
     assert!(turned.is_some(), "a wrong axis");
     let miscounted = victim.tree(|words| words[words[header::NODE_AT] as usize + 130] += 1);

@@ -1,18 +1,17 @@
 //! `volpack build`.
 
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use serde_json::json;
+use serde_json::{Value as Json, json};
 
 use super::progress::Reporter;
 use super::style::{self, GOOD, TITLE};
-use super::{Common, SettingsArgs, VerifyArg, files, print_json};
+use super::{Common, SettingsArgs, VerifyArg, files, outln, print_json};
 use crate::error::{Error, Result};
 use crate::manifest::{DEFAULT_NAME, Manifest, expand};
-use crate::pack::Pack;
 use crate::pipeline::{Job, Outcome, build};
-use crate::report::PackSummary;
 
 #[derive(Args)]
 pub struct BuildArgs {
@@ -41,46 +40,50 @@ pub struct BuildArgs {
 }
 
 pub fn run(args: &BuildArgs, common: Common) -> Result<()> {
-    let mut built = Vec::new();
+    let mut assets = Vec::new();
     let mut failure = None;
     for (name, job) in jobs(args)? {
-        match build_one(&name, &job, args, common) {
-            Ok(asset) => built.push(asset),
+        let mut asset = json!({ "asset": name });
+        if let Err(error) = job.and_then(|job| build_one(&name, &job, args, common, &mut asset)) {
+            asset["error"] = error.to_string().into();
             // One bad asset does not keep the others from being built. All errors are printed, the
             // last by the caller.
-            Err(error) => failure.replace(error).iter().for_each(super::print_error),
+            failure.replace(error).iter().for_each(super::print_error);
         }
+        assets.push(asset);
     }
     if args.json {
-        print_json(&json!({ "assets": built }));
+        print_json(&json!({ "assets": assets }));
     }
     failure.map_or(Ok(()), Err)
 }
 
-fn build_one(name: &str, job: &Job, args: &BuildArgs, common: Common) -> Result<serde_json::Value> {
+/// Builds one pack and adds to `asset` what JSON says of it.
+fn build_one(name: &str, job: &Job, args: &BuildArgs, common: Common, asset: &mut Json) -> Result<()> {
     let mut reporter = Reporter::new(name, common.quiet || args.json);
     let outcome = build(job, &mut reporter);
     reporter.finish();
     let outcome = outcome?;
-    let summary = PackSummary::new(&Pack::open(&job.output).map_err(Error::pack(&job.output))?);
     if !args.json && !common.quiet {
-        print(name, job, &outcome, &summary, common.verbose);
+        print(name, job, &outcome, common.verbose);
     }
-    if let Some(report) = &outcome.verification {
-        super::verify::verdict(&job.output, report)?;
+    let seconds = outcome.seconds.iter().map(|(stage, s)| json!({ "stage": stage, "seconds": s }));
+    asset["output"] = json!(job.output);
+    asset["warnings"] = json!(outcome.warnings);
+    asset["seconds"] = seconds.collect();
+    asset["pack"] = json!(outcome.summary);
+    asset["verification"] = json!(outcome.verification);
+    match &outcome.verification {
+        Some(report) => super::verify::verdict(&job.output, report).map_err(|e| {
+            Error::Verify(format!("{e}\n  It was not written; --verify none writes it all the same."))
+        }),
+        None => Ok(()),
     }
-    Ok(json!({
-        "asset": name,
-        "output": job.output,
-        "warnings": outcome.warnings,
-        "seconds": outcome.seconds.iter().map(|(stage, s)| json!({ "stage": stage, "seconds": s })).collect::<Vec<_>>(),
-        "pack": summary,
-        "verification": outcome.verification,
-    }))
 }
 
 /// The packs that the arguments ask for, with the names to show.
-fn jobs(args: &BuildArgs) -> Result<Vec<(String, Job)>> {
+/// One whose files cannot be found is an error of its own.
+fn jobs(args: &BuildArgs) -> Result<Vec<(String, Result<Job>)>> {
     let job = |frames, output: &Path, settings, max_flip| Job {
         frames,
         output: output.to_owned(),
@@ -95,7 +98,12 @@ fn jobs(args: &BuildArgs) -> Result<Vec<(String, Job)>> {
             .as_deref()
             .ok_or_else(|| Error::Usage("FILES need a pack to go into: add -o OUT.volpack".to_owned()))?;
         let name = output.file_stem().map_or_else(|| "pack".into(), |s| s.to_string_lossy().into_owned());
-        return Ok(vec![(name, job(files(&args.frames)?, output, args.settings.settings(), None))]);
+        return Ok(vec![(name, Ok(job(files(&args.frames)?, output, args.settings.settings(), None)))]);
+    }
+    if args.output.is_some() || args.settings.any() {
+        return Err(Error::Usage(
+            "-o and the settings of a pack go with FILES; for a manifest they stand in it".to_owned(),
+        ));
     }
     if !args.manifest.exists() {
         return Err(Error::Usage(format!(
@@ -112,28 +120,39 @@ fn jobs(args: &BuildArgs) -> Result<Vec<(String, Job)>> {
             message: "there is nothing to build: add an [asset.NAME] with its frames".to_owned(),
         });
     }
-    let named = |name: &String| {
+    let mut jobs: Vec<(String, Result<Job>)> = Vec::new();
+    let mut outputs = HashMap::new();
+    for name in names {
         let asset = manifest.asset(name)?;
-        Ok((name.clone(), job(expand(&asset.frames)?, &asset.output, asset.settings.clone(), asset.max_flip)))
-    };
-    names.into_iter().map(named).collect()
+        if let Some(other) = outputs.insert(&asset.output, name) {
+            return Err(Error::Usage(format!(
+                "assets {other:?} and {name:?} would both be {}",
+                asset.output.display()
+            )));
+        }
+        let frames = expand(&asset.frames);
+        let job = frames.map(|f| job(f, &asset.output, asset.settings.clone(), asset.max_flip));
+        jobs.push((name.clone(), job));
+    }
+    Ok(jobs)
 }
 
-fn print(name: &str, job: &Job, outcome: &Outcome, pack: &PackSummary, verbose: bool) {
+fn print(name: &str, job: &Job, outcome: &Outcome, verbose: bool) {
+    let pack = &outcome.summary;
     let bytes = style::bytes;
-    anstream::println!("{TITLE}{name}{TITLE:#} -> {} ({})", job.output.display(), bytes(pack.file_bytes));
+    outln!("{TITLE}{name}{TITLE:#} -> {} ({})", job.output.display(), bytes(pack.file_bytes));
     super::inspect::print_sizes(pack);
     if let Some(report) = &outcome.verification {
         super::verify::print_summary(report);
     } else {
-        anstream::println!("  not verified against its source (--verify)");
+        outln!("  not verified against its source (--verify)");
     }
     if verbose {
         for (stage, seconds) in &outcome.seconds {
-            anstream::println!("  {stage:22} {seconds:8.3} s");
+            outln!("  {stage:22} {seconds:8.3} s");
         }
     } else {
         let total: f64 = outcome.seconds.iter().map(|(_, s)| s).sum();
-        anstream::println!("  {GOOD}done{GOOD:#} in {}", style::seconds(total));
+        outln!("  {GOOD}done{GOOD:#} in {}", style::seconds(total));
     }
 }

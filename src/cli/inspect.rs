@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::print_json;
 use super::style::{TITLE, bytes, count};
+use super::{outln, print_json};
 use crate::error::{Error, Result};
 use crate::pack::{Pack, layout};
 use crate::report::{GridSummary, PackSummary, VdbSummary};
@@ -53,14 +53,14 @@ fn is_pack(path: &Path) -> Result<bool> {
 
 fn print_vdb(path: &Path, file: &VdbSummary) {
     let by = file.creator.as_ref().map(|c| format!(", by {c}")).unwrap_or_default();
-    anstream::println!(
+    outln!(
         "{TITLE}{}{TITLE:#}: OpenVDB file version {}, library {}{by}",
         path.display(),
         file.version,
         file.library
     );
     if file.grids.is_empty() {
-        anstream::println!("  no grids");
+        outln!("  no grids");
     }
     for grid in &file.grids {
         print_grid(grid);
@@ -70,31 +70,31 @@ fn print_vdb(path: &Path, file: &VdbSummary) {
 fn print_grid(g: &GridSummary) {
     let half = if g.half { " (half)" } else { "" };
     let packable = if g.packable { "" } else { ", cannot be packed" };
-    anstream::println!("\n  {TITLE}{}{TITLE:#}: {}{half}, {}{packable}", g.name, g.value_type, g.class);
-    anstream::println!("    map           {}", g.map);
-    anstream::println!("    background    {}", g.background);
+    outln!("\n  {TITLE}{}{TITLE:#}: {}{half}, {}{packable}", g.name, g.value_type, g.class);
+    outln!("    map           {}", g.map);
+    outln!("    background    {}", g.background);
     let tiles = [("4096³", g.root_tiles), ("128³", g.l1_tiles), ("8³", g.l2_tiles)];
     let tiles: Vec<_> =
         tiles.iter().filter(|(_, n)| *n > 0).map(|(dim, n)| format!("{} of {dim}", count(*n))).collect();
     let tiles = if tiles.is_empty() { "none".to_owned() } else { tiles.join(", ") };
-    anstream::println!("    leaves        {}", count(g.leaves));
-    anstream::println!("    active tiles  {tiles}");
-    anstream::println!("    active voxels {}", count(g.active_voxels));
+    outln!("    leaves        {}", count(g.leaves));
+    outln!("    active tiles  {tiles}");
+    outln!("    active voxels {}", count(g.active_voxels));
     if g.active_voxels > 0 {
         let [a, b, c, d, e, f] = g.bbox;
-        anstream::println!("    box           [{a}, {b}, {c}] to [{d}, {e}, {f}]");
+        outln!("    box           [{a}, {b}, {c}] to [{d}, {e}, {f}]");
     }
     if let Some(v) = &g.values {
-        anstream::println!("    values        {} to {}, sum {}", v.min, v.max, v.sum);
+        outln!("    values        {} to {}, sum {}", v.min, v.max, v.sum);
         if v.nonfinite != 0 {
-            anstream::println!("    not finite    {}", v.nonfinite);
+            outln!("    not finite    {}", v.nonfinite);
         }
     }
 }
 
 fn print_pack(path: &Path, pack: &Pack, summary: &PackSummary) {
     let p = &pack.provenance;
-    anstream::println!(
+    outln!(
         "{TITLE}{}{TITLE:#}: {}, pack format {}, by {} {}",
         path.display(),
         bytes(summary.file_bytes),
@@ -110,12 +110,7 @@ fn print_pack(path: &Path, pack: &Pack, summary: &PackSummary) {
             (Some(only), _) => format!("frame {only}"),
             _ => "no frames".to_owned(),
         };
-        anstream::println!(
-            "  {TITLE}{}{TITLE:#}: {frames}, values {} to {}",
-            grid.name,
-            r.active_min,
-            r.active_max
-        );
+        outln!("  {TITLE}{}{TITLE:#}: {frames}, values {} to {}", grid.name, r.active_min, r.active_max);
     }
     print_sizes(summary);
 }
@@ -123,17 +118,12 @@ fn print_pack(path: &Path, pack: &Pack, summary: &PackSummary) {
 /// The lines that say what a pack holds and takes.
 pub fn print_sizes(p: &PackSummary) {
     let frames = if p.frames == 1 { "frame" } else { "frames" };
-    anstream::println!(
-        "  {} {frames}, {} bricks, {} unique",
-        count(p.frames),
-        count(p.bricks),
-        count(p.unique_bricks)
-    );
+    outln!("  {} {frames}, {} bricks, {} unique", count(p.frames), count(p.bricks), count(p.unique_bricks));
     for (codec, c) in &p.codecs {
         let texels = if c.bytes > 0 { format!("  {}", bytes(c.bytes)) } else { String::new() };
-        anstream::println!("    {codec:9} {:>10} bricks{texels}", count(c.bricks));
+        outln!("    {codec:9} {:>10} bricks{texels}", count(c.bricks));
     }
-    anstream::println!(
+    outln!(
         "  GPU {}: tree {}, masks {}, texels {}; {:.3} bits a voxel",
         bytes(p.gpu_bytes),
         bytes(p.tree_bytes),

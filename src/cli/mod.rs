@@ -47,7 +47,7 @@ struct Common {
     #[arg(short, long, global = true)]
     verbose: bool,
     /// Threads to use; all cores where none are given
-    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
 }
 
@@ -69,21 +69,21 @@ struct SettingsArgs {
     /// A grid to pack; may be given more than once [default: density, else the only scalar grid]
     #[arg(short, long = "grid", value_name = "NAME")]
     grids: Vec<String>,
-    /// How bricks are stored
-    #[arg(short, long, default_value = "unorm8")]
-    format: Format,
-    /// What the 0 and 1 of unorm8, bc4 and bc7 texels stand for
-    #[arg(short, long, default_value = "brick")]
-    range: RangeMode,
-    /// Whether bricks keep their active masks
-    #[arg(long, default_value = "auto")]
-    masks: Masks,
-    /// What to do with infinities and NaNs
-    #[arg(long, default_value = "refuse")]
-    nonfinite: NonFinite,
-    /// zstd level of the file, 0 to store everything raw
-    #[arg(long, value_name = "LEVEL", default_value_t = DEFAULT_ZSTD, value_parser = clap::value_parser!(i32).range(0..=22))]
-    zstd: i32,
+    /// How bricks are stored [default: unorm8]
+    #[arg(short, long)]
+    format: Option<Format>,
+    /// What the 0 and 1 of unorm8, bc4 and bc7 texels stand for [default: brick]
+    #[arg(short, long)]
+    range: Option<RangeMode>,
+    /// Whether bricks keep their active masks [default: auto]
+    #[arg(long)]
+    masks: Option<Masks>,
+    /// What to do with infinities and NaNs [default: refuse]
+    #[arg(long)]
+    nonfinite: Option<NonFinite>,
+    /// zstd level of the file, 0 to store everything raw [default: 3]
+    #[arg(long, value_name = "LEVEL", value_parser = clap::value_parser!(i32).range(0..=22))]
+    zstd: Option<i32>,
     /// Frames per second, for engines that play the pack
     #[arg(long, value_name = "RATE", value_parser = positive)]
     fps: Option<f32>,
@@ -100,13 +100,24 @@ impl SettingsArgs {
     fn settings(&self) -> Settings {
         Settings {
             grids: self.grids.clone(),
-            format: self.format,
-            range: self.range,
-            masks: self.masks,
-            nonfinite: self.nonfinite,
-            zstd: self.zstd,
+            format: self.format.unwrap_or_default(),
+            range: self.range.unwrap_or_default(),
+            masks: self.masks.unwrap_or_default(),
+            nonfinite: self.nonfinite.unwrap_or_default(),
+            zstd: self.zstd.unwrap_or(DEFAULT_ZSTD),
             fps: self.fps,
         }
+    }
+
+    /// Whether any is given.
+    fn any(&self) -> bool {
+        !self.grids.is_empty()
+            || self.format.is_some()
+            || self.range.is_some()
+            || self.masks.is_some()
+            || self.nonfinite.is_some()
+            || self.zstd.is_some()
+            || self.fps.is_some()
     }
 }
 
@@ -167,6 +178,25 @@ pub fn run(cli: Cli) -> Result<()> {
     }
 }
 
+/// Prints a line on standard output. A reader that went away, as `head` does, is no error; a full disk is.
+macro_rules! outln {
+    ($($arg:tt)*) => {{
+        use std::io::Write as _;
+        if let Err(error) = writeln!(anstream::stdout(), $($arg)*) {
+            $crate::cli::stdout_failed(&error);
+        }
+    }};
+}
+use outln;
+
+fn stdout_failed(error: &std::io::Error) -> ! {
+    if error.kind() == std::io::ErrorKind::BrokenPipe {
+        std::process::exit(0);
+    }
+    eprintln!("error: standard output: {error}");
+    std::process::exit(1);
+}
+
 /// Prints an error whole, and where it may help how to go on.
 pub fn print_error(error: &Error) {
     let style = style::ERROR;
@@ -180,5 +210,5 @@ fn files(patterns: &[PathBuf]) -> Result<Vec<PathBuf>> {
 
 fn print_json(value: &impl serde::Serialize) {
     let text = serde_json::to_string_pretty(value).expect("reports have string keys and finite numbers");
-    anstream::println!("{text}");
+    outln!("{text}");
 }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::{Common, style};
+use super::{Common, outln, style};
 use crate::error::{Error, Result};
 use crate::pack::Pack;
 use crate::render::gpu::GpuError;
@@ -63,6 +63,9 @@ fn size(text: &str) -> std::result::Result<[u32; 2], String> {
 
 pub fn run(args: &RenderArgs, common: Common) -> Result<()> {
     let pack = Pack::open(&args.pack).map_err(Error::pack(&args.pack))?;
+    if args.output.canonicalize().is_ok_and(|o| args.pack.canonicalize().is_ok_and(|p| o == p)) {
+        return Err(Error::Usage(format!("{} is the pack and the picture too", args.output.display())));
+    }
     let names: Vec<&str> = pack.grids.iter().map(|g| g.name.as_str()).collect();
     let grid = args.grid.as_ref().map_or(Some(0), |name| names.iter().position(|n| n == name));
     let grid = grid.ok_or_else(|| {
@@ -72,7 +75,7 @@ pub fn run(args: &RenderArgs, common: Common) -> Result<()> {
     let renderer = Renderer::new(&pack, args.device).map_err(|e| gpu_error(e, &args.pack))?;
     if !common.quiet {
         let why = renderer.fallback.as_ref().map(|why| format!(" ({why})")).unwrap_or_default();
-        anstream::eprintln!("tracing with {}{why}", renderer.device());
+        anstream::eprintln!("tracing with {}{why}", renderer.device_name());
     }
 
     let mode = args.mode.unwrap_or(if pack.grids[grid].record.class == GridClass::LevelSet as u32 {
@@ -99,7 +102,7 @@ pub fn run(args: &RenderArgs, common: Common) -> Result<()> {
     if !common.quiet {
         let what = if frames.len() == 1 { "1 frame".to_owned() } else { format!("{} frames", frames.len()) };
         let title = style::TITLE;
-        anstream::println!("{title}{}{title:#}: {what}, {steps:.1} steps a ray", args.output.display());
+        outln!("{title}{}{title:#}: {what}, {steps:.1} steps a ray", args.output.display());
     }
     Ok(())
 }
@@ -127,6 +130,7 @@ fn frames(args: &RenderArgs, pack: &Pack, grid: usize) -> Result<Vec<usize>> {
 fn write(args: &RenderArgs, pictures: &[Vec<u8>], fps: f32) -> Result<()> {
     let failed = || Error::io(&args.output);
     let folder = args.output.parent().filter(|f| *f != Path::new("")).unwrap_or(Path::new("."));
+    std::fs::create_dir_all(folder).map_err(Error::io(folder))?;
     let file = tempfile::NamedTempFile::new_in(folder).map_err(failed())?;
     let out = BufWriter::new(file.as_file());
     match pictures {

@@ -7,7 +7,7 @@ use serde_json::json;
 
 use super::progress::Reporter;
 use super::style::{ERROR, GOOD, TITLE, psnr};
-use super::{Common, PictureArgs, files, print_json};
+use super::{Common, PictureArgs, files, outln, print_json};
 use crate::error::{Error, Result};
 use crate::manifest::{DEFAULT_NAME, Manifest, expand};
 use crate::pipeline::{check_structure, verify_against};
@@ -49,7 +49,7 @@ pub fn run(args: &VerifyArgs, common: Common) -> Result<()> {
         if args.json {
             print_json(&json!({ "ok": true }));
         } else if !common.quiet {
-            anstream::println!("{TITLE}{}{TITLE:#}: structure {GOOD}ok{GOOD:#}", args.pack.display());
+            outln!("{TITLE}{}{TITLE:#}: structure {GOOD}ok{GOOD:#}", args.pack.display());
         }
         return Ok(());
     }
@@ -64,7 +64,7 @@ pub fn run(args: &VerifyArgs, common: Common) -> Result<()> {
     if args.json {
         print_json(&report);
     } else if !common.quiet {
-        anstream::println!("{TITLE}{}{TITLE:#}", args.pack.display());
+        outln!("{TITLE}{}{TITLE:#}", args.pack.display());
         print_summary(&report);
         if common.verbose {
             print_frames(&report);
@@ -106,7 +106,7 @@ fn sources_in_manifest(args: &VerifyArgs) -> Result<(Vec<PathBuf>, Option<f64>)>
 /// The lines that say how near a pack is to its source.
 pub fn print_summary(report: &VerifyReport) {
     let verdict = if report.ok { format!("{GOOD}ok{GOOD:#}") } else { format!("{ERROR}failed{ERROR:#}") };
-    anstream::println!("  verified against its source: {verdict}");
+    outln!("  verified against its source: {verdict}");
     for grid in &report.grids {
         let m = &grid.active;
         let flips = if m.sign_flips > 0 { format!(", {} sign flips", m.sign_flips) } else { String::new() };
@@ -115,10 +115,10 @@ pub fn print_summary(report: &VerifyReport) {
         } else {
             String::new()
         };
-        anstream::println!("    {:12} {}{error}{flips}", grid.grid, psnr(m.psnr));
+        outln!("    {:12} {}{error}{flips}", grid.grid, psnr(m.psnr));
     }
     if let (Some(worst), true) = (&report.worst_frame, report.frames.len() > 1) {
-        anstream::println!("    worst frame  {} of {}: {:.2} dB", worst.frame, worst.grid, worst.psnr);
+        outln!("    worst frame  {} of {}: {:.2} dB", worst.frame, worst.grid, worst.psnr);
     }
     if let Some(pictures) = &report.pictures {
         print_pictures(pictures);
@@ -131,14 +131,14 @@ fn print_pictures(report: &PicturesReport) {
         (Some(device), _) => {
             let pixels: u64 = of_tracers.map(|t| t.pixels).sum();
             let pixels = if pixels == 0 { "no".to_owned() } else { pixels.to_string() };
-            anstream::println!("    pictures     {device} and the CPU tracer: {pixels} pixels differ");
+            outln!("    pictures     {device} and the CPU tracer: {pixels} pixels differ");
         }
-        (None, Some(why)) => anstream::println!("    pictures     by the CPU tracer alone: {why}"),
-        (None, None) => anstream::println!("    pictures     by the CPU tracer alone"),
+        (None, Some(why)) => outln!("    pictures     by the CPU tracer alone: {why}"),
+        (None, None) => outln!("    pictures     by the CPU tracer alone"),
     }
     let worst = report.pictures.iter().max_by(|a, b| a.source.flip.total_cmp(&b.source.flip));
     if let Some(p) = worst {
-        anstream::println!(
+        outln!(
             "    to the eye   FLIP {:.4} of at most {:.4}, {} (frame {} of {})",
             p.source.flip,
             report.max_flip,
@@ -151,7 +151,7 @@ fn print_pictures(report: &PicturesReport) {
 
 fn print_frames(report: &VerifyReport) {
     for frame in &report.frames {
-        anstream::println!(
+        outln!(
             "      {:12} frame {:5}  {:>10}  largest error {:.3e}",
             frame.grid,
             frame.frame,

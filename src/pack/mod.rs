@@ -19,4 +19,4 @@ pub use error::PackError;
 pub use provenance::{Provenance, Source};
 pub use reader::{Frame, Grid, Pack};
 pub(crate) use writer::make_readable;
-pub use writer::{PackWriter, SectionSpec, compress_chunk};
+pub use writer::{FinishedPack, PackWriter, SectionSpec, compress_chunk};

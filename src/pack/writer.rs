@@ -162,14 +162,14 @@ impl PackWriter {
         Ok(())
     }
 
-    /// Fills in the tables, syncs, and moves the file to its place. Returns its length.
+    /// Fills in the tables and syncs. The file is whole then, but not yet in its place.
     ///
     /// # Errors
-    /// When the file cannot be written or renamed.
+    /// When the file cannot be written.
     ///
     /// # Panics
     /// When what was written is not what was announced.
-    pub fn finish(mut self) -> io::Result<u64> {
+    pub fn finish(mut self) -> io::Result<FinishedPack> {
         assert_eq!(self.sections.len(), self.specs.len(), "every announced section is written");
         assert_eq!(self.chunks.len(), self.chunk_total, "every announced chunk is written");
         for (section, spec) in self.sections.iter_mut().zip(&self.specs) {
@@ -197,8 +197,28 @@ impl PackWriter {
         let file = self.out.into_inner().map_err(io::IntoInnerError::into_error)?;
         file.as_file().sync_all()?;
         make_readable(file.as_file())?;
-        file.persist(&self.path).map_err(|e| e.error)?;
-        Ok(self.at)
+        Ok(FinishedPack { file, path: self.path })
+    }
+}
+
+/// A pack that is whole and lies beside its final place. It is gone if it is dropped.
+pub struct FinishedPack {
+    file: NamedTempFile,
+    path: PathBuf,
+}
+
+impl FinishedPack {
+    /// Where it lies for now.
+    pub fn path(&self) -> &Path {
+        self.file.path()
+    }
+
+    /// Moves it to its place, in one step over whatever was there.
+    ///
+    /// # Errors
+    /// When it cannot be renamed.
+    pub fn persist(self) -> io::Result<()> {
+        self.file.persist(&self.path).map(drop).map_err(|e| e.error)
     }
 }
 

@@ -6,7 +6,7 @@ use super::cpu::{Scene, trace};
 use super::field::Field;
 use super::gpu::{Gpu, GpuError, Uploaded};
 use super::image::Image;
-use crate::pack::{Pack, PackError};
+use crate::pack::{FrameReader, Pack};
 
 /// What traces a picture.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
@@ -23,6 +23,7 @@ pub enum Device {
 /// Traces frames of one pack.
 pub struct Renderer<'a> {
     pack: &'a Pack,
+    device: Device,
     gpu: Option<(&'static Gpu, Uploaded)>,
     /// Why it is the CPU though a GPU would have been welcome.
     pub fallback: Option<String>,
@@ -35,22 +36,24 @@ impl<'a> Renderer<'a> {
     /// With [`Device::Gpu`], when there is none or it cannot hold the pack.
     pub fn new(pack: &'a Pack, device: Device) -> Result<Self, GpuError> {
         if device == Device::Cpu {
-            return Ok(Self { pack, gpu: None, fallback: None });
+            return Ok(Self { pack, device, gpu: None, fallback: None });
         }
         let opened = Gpu::shared().and_then(|gpu| {
             let uploaded = gpu.upload(pack)?;
             Ok((gpu, uploaded))
         });
         match opened {
-            Ok(gpu) => Ok(Self { pack, gpu: Some(gpu), fallback: None }),
+            Ok(gpu) => Ok(Self { pack, device, gpu: Some(gpu), fallback: None }),
             Err(GpuError::Pack(e)) => Err(GpuError::Pack(e)),
-            Err(e) if device == Device::Auto => Ok(Self { pack, gpu: None, fallback: Some(e.to_string()) }),
+            Err(e) if device == Device::Auto => {
+                Ok(Self { pack, device, gpu: None, fallback: Some(e.to_string()) })
+            }
             Err(e) => Err(e),
         }
     }
 
     /// The name of what traces.
-    pub fn device(&self) -> &str {
+    pub fn device_name(&self) -> &str {
         self.gpu.as_ref().map_or("CPU tracer", |(gpu, _)| &gpu.name)
     }
 
@@ -66,11 +69,19 @@ impl<'a> Renderer<'a> {
     pub fn render(&self, grid: usize, frame: usize, scene: &Scene) -> Result<Image, GpuError> {
         let reader = self.pack.frame(grid, frame)?;
         match &self.gpu {
-            Some((gpu, uploaded)) => gpu.trace(uploaded, [grid as u32, frame as u32], reader.bounds(), scene),
-            None => {
-                let field = Field::from_pack(&reader).map_err(|e: PackError| GpuError::Pack(e))?;
-                trace::<f32>(&field, scene).ok_or(GpuError::Transform)
+            Some((gpu, uploaded)) => {
+                let traced = gpu.trace(uploaded, [grid as u32, frame as u32], reader.bounds(), scene);
+                match traced {
+                    // A picture too large for the adapter.
+                    Err(GpuError::Lacks { .. }) if self.device == Device::Auto => on_cpu(&reader, scene),
+                    traced => traced,
+                }
             }
+            None => on_cpu(&reader, scene),
         }
     }
+}
+
+fn on_cpu(reader: &FrameReader, scene: &Scene) -> Result<Image, GpuError> {
+    trace::<f32>(&Field::from_pack(reader)?, scene).ok_or(GpuError::Transform)
 }

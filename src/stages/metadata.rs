@@ -44,6 +44,9 @@ pub struct SequenceInfo {
 /// # Errors
 /// The first file, in the given order, that cannot be read; two files of one frame.
 pub fn read(paths: &[PathBuf]) -> Result<SequenceInfo> {
+    if paths.is_empty() {
+        return Err(Error::Input("there are no frames to read".to_owned()));
+    }
     let mut warnings = Vec::new();
     let numbers = frame_numbers(paths, &mut warnings)?;
     let mut frames = paths

@@ -102,7 +102,7 @@ pub fn pictures(pack: &Pack, sources: &Sources, settings: &PictureSettings) -> R
     let format = pack.provenance.settings.format;
     let renderer = Renderer::new(pack, settings.device).map_err(|e| Error::Unsupported(e.to_string()))?;
     let mut report = PicturesReport {
-        device: renderer.is_gpu().then(|| renderer.device().to_owned()),
+        device: renderer.is_gpu().then(|| renderer.device_name().to_owned()),
         skipped: renderer.fallback.clone(),
         max_flip: settings.max_flip.unwrap_or(default_max_flip(format)),
         pictures: Vec::new(),
@@ -121,7 +121,7 @@ pub fn pictures(pack: &Pack, sources: &Sources, settings: &PictureSettings) -> R
                 report.failures.push(format!(
                     "{what}: {} pixels differ between {} and the CPU tracer, by up to {:.2e}",
                     t.pixels,
-                    renderer.device(),
+                    renderer.device_name(),
                     t.largest
                 ));
             }

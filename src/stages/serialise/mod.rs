@@ -13,7 +13,7 @@ use super::relayout;
 use crate::codec::Codec;
 use crate::pack::layout::{AtlasRecord, CHUNK_BYTES, FrameRecord, GridRecord, encoding, kind};
 use crate::pack::tree::L3Record;
-use crate::pack::{Atlas, PackWriter, Provenance, SectionSpec, compress_chunk};
+use crate::pack::{Atlas, FinishedPack, PackWriter, Provenance, SectionSpec, compress_chunk};
 use crate::vdb::GridClass;
 use tree::{CellBox, TreeWords};
 
@@ -63,7 +63,7 @@ pub enum SerialiseError {
     },
 }
 
-/// Writes the pack and returns its length. All grids use the codec of the first.
+/// Writes the pack beside `path`, where its caller puts it once it is verified. All grids use the codec of the first.
 ///
 /// # Errors
 /// [`SerialiseError`]. Nothing is left at `path` that was not there before.
@@ -76,7 +76,7 @@ pub fn serialise(
     provenance: &Provenance,
     zstd_level: Option<i32>,
     mut progress: impl FnMut(u64),
-) -> Result<u64, SerialiseError> {
+) -> Result<FinishedPack, SerialiseError> {
     let codec = grids[0].allocation.codec;
     let bricks: u64 = grids.iter().map(|g| u64::from(g.tree.pool.len())).sum();
     if bricks >= L3Record::MAX_SLOTS.into() {
@@ -229,7 +229,7 @@ fn set_errors(frames: &mut [FrameRecord], grids: &[GridInput], outcomes: &[Outco
     for (grid, outcome) in grids.iter().zip(outcomes) {
         for (tree, frame) in grid.tree.frames.iter().zip(&mut frames) {
             let squares: f64 = frame_bricks(&grid.tree, tree).map(|id| outcome.squares[id as usize]).sum();
-            frame.error_norm = squares.sqrt() as f32;
+            frame.error_norm = (squares.sqrt() as f32).min(f32::MAX);
         }
     }
 }

@@ -12,9 +12,9 @@ use crate::stages::dedup::{CellRef, FrameTree, Payload, SequenceTree};
 use crate::stages::quantise::Outcome;
 use crate::volume::{CELL_DIM, Constant, Coord, Interner, ROOT_DIM};
 
-/// L1 nodes a frame may have room for: 4 MB of links. A box of 100 of them an axis is 400,000 voxels
-/// wide; only stray voxels far from the rest need more.
-const MAX_ROOTS: i64 = 1 << 20;
+/// L1 nodes that all frames of a grid may have room for: 64 MB of links. A box of 40 of them an axis is
+/// 160,000 voxels wide, for 240 frames; only stray voxels far from the rest need more.
+const MAX_ROOTS: i64 = 1 << 24;
 
 /// The part of index space that a grid's L1 nodes cover.
 pub(super) struct CellBox {
@@ -51,7 +51,8 @@ impl CellBox {
         }
         let extent: [i64; 3] = std::array::from_fn(|a| max[a] - min[a]);
         let roots = if one_node { [1; 3] } else { extent.map(|e| e / root) };
-        if roots.iter().try_fold(1i64, |n, r| n.checked_mul(*r)).is_none_or(|n| n > MAX_ROOTS) {
+        let frames = grid.frames.len().max(1) as i64;
+        if roots.iter().try_fold(frames, |n, r| n.checked_mul(*r)).is_none_or(|n| n > MAX_ROOTS) {
             return Err(too_large(
                 &grid.name,
                 format!(
