@@ -44,12 +44,16 @@ fn differing(a: &Image, b: &Image, channels: std::ops::Range<usize>, tolerance: 
     apart.filter(|d| *d > tolerance).fold((0, 0.0), |(n, most), d| (n + 1, most.max(d)))
 }
 
+/// Boxes of thousands of voxels an axis, with several L1 nodes and tiles of 4096³.
+const VAST: [&str; 2] = ["negative", "tiles"];
+
 fn cases() -> Vec<(&'static str, Vec<std::path::PathBuf>, &'static str)> {
     vec![
         ("fog", vec![fixture("fog_half_blosc.vdb")], "density"),
         ("animation", animation(), "density"),
         ("ball", vec![fixture("levelset_half.vdb")], "surface"),
-        ("tiles", vec![fixture("types.vdb")], "density"),
+        ("types", vec![fixture("types.vdb")], "density"),
+        ("tiles", vec![fixture("tiles.vdb")], "density"),
         ("negative", vec![fixture("negative.vdb")], "density"),
     ]
 }
@@ -62,7 +66,7 @@ fn hdda_and_dda_see_the_same() {
         let (pack, _) = build_verified(&frames, settings, folder.path());
         let field = Field::from_pack(&pack.frame(0, 0).unwrap()).unwrap();
         // A box of thousands of voxels takes a DDA too long.
-        if name == "negative" {
+        if VAST.contains(&name) {
             continue;
         }
         for mode in Mode::ALL {
@@ -112,7 +116,7 @@ fn the_shader_sees_what_the_cpu_sees() {
             assert_eq!(reader.bounds(), field.bounds);
             for mode in Mode::ALL {
                 for traversal in [Traversal::Dda, Traversal::Hdda] {
-                    if traversal == Traversal::Dda && (name == "negative" || mode != Mode::Density) {
+                    if traversal == Traversal::Dda && (VAST.contains(&name) || mode != Mode::Density) {
                         continue;
                     }
                     let scene = scene(&pack, &field, mode, traversal);
@@ -129,7 +133,9 @@ fn the_shader_sees_what_the_cpu_sees() {
                     let pixels = (SIZE[0] * SIZE[1]) as usize;
                     let allowed = match format {
                         Format::Bc4 => pixels / 200,
-                        _ if mode.is_categorical() => pixels / 1000,
+                        // Thousands of voxels away, the last bit of an f32 direction is a thousandth of a
+                        // voxel: there rays tie in measures too.
+                        _ if mode.is_categorical() || VAST.contains(&name) => pixels / 1000,
                         _ => 0,
                     };
                     assert!(
