@@ -1,13 +1,15 @@
 //! Every format and range on each volume, and the tree beside the thesis's layout.
 
 use std::error::Error;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Instant;
 
 use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::report::PackSummary;
 use volpack::settings::{Format, RangeMode, Settings};
+
+use crate::sequence;
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -26,14 +28,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     println!("| volume | format | range | GPU KiB | bits/voxel | PSNR dB | largest error / peak | build s |");
     println!("|---|---|---|---|---|---|---|---|");
     for sequence in &args.sequences {
-        let frames = volpack::manifest::expand(std::slice::from_ref(sequence))?;
-        // A sequence goes by its folder's name.
-        let named = if frames.len() == 1 {
-            sequence.file_stem()
-        } else {
-            sequence.parent().and_then(Path::file_name)
-        };
-        let name = named.unwrap_or_default().to_string_lossy().into_owned();
+        let (name, frames) = sequence::named(sequence)?;
         for format in Format::ALL {
             for range in [RangeMode::Brick, RangeMode::Sequence] {
                 if range == RangeMode::Sequence && !format.codec().is_normalised() {

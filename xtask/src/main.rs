@@ -9,6 +9,7 @@ mod openvdb;
 mod peers;
 mod pictures;
 mod read;
+mod sequence;
 mod trace;
 
 use std::error::Error;

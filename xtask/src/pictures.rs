@@ -1,13 +1,15 @@
 //! What each format costs the eye: pictures of pack and source, by the CPU tracer.
 
 use std::error::Error;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::render::Device;
 use volpack::settings::{Format, Settings};
 use volpack::verify::{PictureSettings, Sources, pictures};
+
+use crate::sequence;
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -25,14 +27,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     println!("| volume | format | FLIP | PSNR of the picture | RMSE of the picture |");
     println!("|---|---|---|---|---|");
     for sequence in &args.sequences {
-        let frames = volpack::manifest::expand(std::slice::from_ref(sequence))?;
-        // A sequence goes by its folder's name.
-        let named = if frames.len() == 1 {
-            sequence.file_stem()
-        } else {
-            sequence.parent().and_then(Path::file_name)
-        };
-        let name = named.unwrap_or_default().to_string_lossy();
+        let (name, frames) = sequence::named(sequence)?;
         for format in Format::ALL {
             let job = Job {
                 frames: frames.clone(),
