@@ -119,21 +119,19 @@ pub fn build(job: &Job, progress: &mut dyn Progress) -> Result<Outcome> {
         .map_err(|e| serialise_error(e, &grids, &job.output))?;
     clock.lap("encode and serialise");
 
-    let verification = match job.verify {
-        VerifyLevel::None => None,
-        VerifyLevel::Structure => {
-            check_structure(finished.path())?;
-            None
-        }
-        VerifyLevel::Voxels | VerifyLevel::All => {
-            let pack = check_structure(finished.path())?;
-            let pictures = (job.verify == VerifyLevel::All).then_some(&job.pictures);
-            Some(verify_against(&pack, &job.frames, pictures, progress)?)
-        }
+    let pack = match job.verify {
+        VerifyLevel::None => Pack::open(finished.path()).map_err(Error::pack(finished.path()))?,
+        _ => check_structure(finished.path())?,
+    };
+    let verification = if job.verify >= VerifyLevel::Voxels {
+        let pictures = (job.verify == VerifyLevel::All).then_some(&job.pictures);
+        Some(verify_against(&pack, &job.frames, pictures, progress)?)
+    } else {
+        None
     };
     clock.lap("verify");
-    let pack = Pack::open(finished.path()).map_err(Error::pack(finished.path()))?;
     let summary = PackSummary::new(&pack);
+    // A mapped file cannot be renamed everywhere.
     drop(pack);
     if verification.as_ref().is_none_or(|report| report.ok) {
         finished.persist().map_err(Error::io(&job.output))?;

@@ -203,11 +203,6 @@ pub fn print_error(error: &Error) {
     anstream::eprintln!("{style}error{style:#}: {error}");
 }
 
-/// Expands globs that the shell did not.
-fn files(patterns: &[PathBuf]) -> Result<Vec<PathBuf>> {
-    crate::manifest::expand(patterns)
-}
-
 fn print_json(value: &impl serde::Serialize) {
     let text = serde_json::to_string_pretty(value).expect("reports have string keys and finite numbers");
     outln!("{text}");

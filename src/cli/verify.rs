@@ -7,7 +7,7 @@ use serde_json::json;
 
 use super::progress::Reporter;
 use super::style::{ERROR, GOOD, TITLE, psnr};
-use super::{Common, PictureArgs, files, outln, print_json};
+use super::{Common, PictureArgs, outln, print_json};
 use crate::error::{Error, Result};
 use crate::manifest::{DEFAULT_NAME, Manifest, expand};
 use crate::pipeline::{check_structure, verify_against};
@@ -54,7 +54,7 @@ pub fn run(args: &VerifyArgs, common: Common) -> Result<()> {
         return Ok(());
     }
     let (sources, max_flip) =
-        if args.source.is_empty() { sources_in_manifest(args)? } else { (files(&args.source)?, None) };
+        if args.source.is_empty() { sources_in_manifest(args)? } else { (expand(&args.source)?, None) };
     let settings = args.pictures.settings(max_flip);
     let mut reporter = Reporter::new("verify", common.quiet || args.json);
     let pictures = (args.level == Level::All).then_some(&settings);

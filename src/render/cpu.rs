@@ -168,19 +168,21 @@ impl<F: Real> Tracer<'_, F> {
         Coord(std::array::from_fn(|a| cell[a] + self.setup.base[a]))
     }
 
-    /// The node to step over: the whole of it for HDDA where it has one value, else one cell.
-    fn node(&self, cell: [i32; 3]) -> (Box3, Option<f32>) {
-        let found = self.field.find(self.voxel(cell));
-        let constant = match found.content {
-            Content::Constant(constant) => Some(constant.value),
-            Content::Brick(..) => None,
+    /// The node to step over (the whole of it for HDDA where it has one value, else one cell), whether
+    /// it has one value, and the value of the cell's voxel.
+    fn node(&self, cell: [i32; 3]) -> (Box3, bool, f32) {
+        let voxel = self.voxel(cell);
+        let found = self.field.find(voxel);
+        let (constant, value) = match found.content {
+            Content::Constant(constant) => (true, constant.value),
+            Content::Brick(values, _) => (false, values[voxel.child_index(3, 1)]),
         };
         match (constant, self.scene.traversal) {
-            (Some(_), Traversal::Hdda) => {
+            (true, Traversal::Hdda) => {
                 let min = std::array::from_fn(|a| found.origin.0[a] - self.setup.base[a]);
-                (Box3::cube(min, found.dim), constant)
+                (Box3::cube(min, found.dim), constant, value)
             }
-            _ => (Box3::cube(cell, 1), constant),
+            _ => (Box3::cube(cell, 1), constant, value),
         }
     }
 
@@ -191,11 +193,9 @@ impl<F: Real> Tracer<'_, F> {
         let Some(mut walk) = Walk::enter(ray, bounds) else { return depth };
         while bounds.contains(walk.cell) && *steps < MAX_STEPS {
             *steps += 1;
-            let (node, constant) = self.node(walk.cell);
-            let node = node.within(bounds);
-            let value = constant.unwrap_or_else(|| self.field.value(self.voxel(walk.cell)));
+            let (node, _, value) = self.node(walk.cell);
             let from = walk.t;
-            walk.leave(ray, node);
+            walk.leave(ray, node.within(bounds));
             depth = depth + (walk.t - from) * F::from_f64(value.into());
         }
         depth
@@ -220,8 +220,7 @@ impl<F: Real> Tracer<'_, F> {
     ) -> Option<Hit<F>> {
         while bounds.contains(walk.cell) && *steps < MAX_STEPS {
             *steps += 1;
-            let (node, constant) = self.node(walk.cell);
-            let value = constant.unwrap_or_else(|| self.field.value(self.voxel(walk.cell)));
+            let (node, _, value) = self.node(walk.cell);
             if value > self.scene.threshold {
                 return Some(Hit { t: walk.t, cell: walk.cell, normal: None, axis: walk.axis, value });
             }
@@ -242,9 +241,9 @@ impl<F: Real> Tracer<'_, F> {
         let mut negative = None;
         while bounds.contains(walk.cell) && *steps < MAX_STEPS {
             *steps += 1;
-            let (node, constant) = self.node(walk.cell);
+            let (node, constant, value) = self.node(walk.cell);
             let inner = Box3 { min: node.min, max: node.max.map(|v| v - 1) };
-            if let (Some(value), true) = (constant, inner.contains(walk.cell)) {
+            if constant && inner.contains(walk.cell) {
                 let sign = value < 0.0;
                 if negative.is_some_and(|n| n != sign) {
                     return Some(self.surface_hit(ray, &walk, walk.t));

@@ -46,8 +46,6 @@ pub enum GpuError {
 pub struct Gpu {
     /// The adapter's name.
     pub name: String,
-    /// Whether it is a CPU that runs shaders.
-    pub is_software: bool,
     device: wgpu::Device,
     queue: wgpu::Queue,
     pipeline: wgpu::ComputePipeline,
@@ -58,7 +56,6 @@ pub struct Gpu {
 pub struct Uploaded {
     tree: wgpu::Buffer,
     textures: [wgpu::TextureView; 5],
-    bytes: u64,
 }
 
 #[derive(Clone, Copy, Pod, Zeroable)]
@@ -142,8 +139,7 @@ impl Gpu {
             compilation_options: wgpu::PipelineCompilationOptions::default(),
             cache: None,
         });
-        let is_software = info.device_type == wgpu::DeviceType::Cpu;
-        Ok(Self { name: info.name, is_software, device, queue, pipeline, timestamps })
+        Ok(Self { name: info.name, device, queue, pipeline, timestamps })
     }
 
     fn layout(device: &wgpu::Device) -> wgpu::PipelineLayout {
@@ -190,7 +186,6 @@ impl Gpu {
             contents: bytemuck::cast_slice(&pack.tree),
             usage: wgpu::BufferUsages::STORAGE,
         });
-        let mut bytes = tree_bytes;
         let mut views = Vec::new();
         for codec in Codec::WITH_TEXELS {
             views.push(match pack.atlas(codec) {
@@ -210,13 +205,12 @@ impl Gpu {
                             "has 3-D textures of {most} texels an axis, a page is {size:?}"
                         )));
                     }
-                    bytes += atlas.bytes();
                     self.upload_page(pack, atlas, size)?
                 }
             });
         }
         let textures = views.try_into().expect("five codecs have texels");
-        Ok(Uploaded { tree, textures, bytes })
+        Ok(Uploaded { tree, textures })
     }
 
     fn texture(&self, format: wgpu::TextureFormat, size: [u32; 3]) -> wgpu::Texture {
@@ -371,13 +365,6 @@ impl Gpu {
         drop(view);
         buffer.unmap();
         Ok(values)
-    }
-}
-
-impl Uploaded {
-    /// Bytes of tree and pages.
-    pub fn bytes(&self) -> u64 {
-        self.bytes
     }
 }
 
