@@ -3,7 +3,7 @@
 //! Three rings. Structure is [`crate::pack::Pack::open`] with [`crate::pack::Pack::check_chunks`]. Voxels
 //! ([`voxels`]) reads the source anew and asks the pack for every leaf voxel and every tile of it,
 //! without anything that the build computed. Pictures
-//! ([`pictures`]) traces both.
+//! ([`pictures()`]) traces both.
 
 mod compare;
 mod metrics;
