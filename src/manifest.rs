@@ -6,7 +6,9 @@ use std::path::{Path, PathBuf};
 use serde::Deserialize;
 
 use crate::error::{Error, Result};
-use crate::settings::{DEFAULT_ZSTD, Format, Masks, NonFinite, RangeMode, Settings};
+use crate::settings::{
+    ByteSize, ClusterArgs, DEFAULT_ZSTD, Dedup, ErrorBound, Format, Masks, NonFinite, QualityArgs, RangeMode, Settings,
+};
 
 /// The manifest's name where none is given.
 pub const DEFAULT_NAME: &str = "pipeline.toml";
@@ -46,6 +48,17 @@ struct RawAsset {
     grids: Option<Vec<String>>,
     #[serde(default)]
     format: Format,
+    psnr: Option<f64>,
+    max_error: Option<ErrorBound>,
+    bits_per_voxel: Option<f64>,
+    size: Option<ByteSize>,
+    min_frame_psnr: Option<f64>,
+    #[serde(default)]
+    dedup: Dedup,
+    clusters: Option<u32>,
+    iterations: Option<u32>,
+    variance: Option<f64>,
+    seed: Option<u64>,
     #[serde(default)]
     range: RangeMode,
     #[serde(default)]
@@ -123,6 +136,23 @@ impl RawAsset {
             }
             flip => flip.map(toml::Spanned::into_inner),
         };
+        let adaptive = QualityArgs {
+            psnr: self.psnr,
+            max_error: self.max_error,
+            bits_per_voxel: self.bits_per_voxel,
+            size: self.size,
+            min_frame_psnr: self.min_frame_psnr,
+        };
+        let clusters = ClusterArgs {
+            dedup: Some(self.dedup),
+            clusters: self.clusters,
+            iterations: self.iterations,
+            variance: self.variance,
+            seed: self.seed,
+        };
+        let in_asset = |e: String| format!("asset {name:?}: {e}");
+        let quality = adaptive.quality(self.format).map_err(in_asset)?;
+        let clustering = clusters.clustering().map_err(in_asset)?;
         let frames = match self.frames {
             OneOrMany::One(one) => vec![one],
             OneOrMany::Many(many) => many,
@@ -135,6 +165,9 @@ impl RawAsset {
             settings: Settings {
                 grids,
                 format: self.format,
+                quality,
+                min_frame_psnr: self.min_frame_psnr,
+                clustering,
                 range: self.range,
                 masks: self.masks,
                 nonfinite: self.nonfinite,

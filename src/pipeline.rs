@@ -9,14 +9,14 @@ use crate::error::{Error, Result};
 use crate::pack::{Pack, Provenance, Source};
 use crate::report::PackSummary;
 use crate::settings::{Format, Masks, Settings};
-use crate::stages::allocate::allocate;
+use crate::stages::allocate::{self, AdaptiveGrid, AllocateError, Allocation, Target};
 use crate::stages::dedup::{DedupError, MaskPolicy, SequenceTree};
 use crate::stages::flatten::{Flattened, flatten};
 use crate::stages::metadata::{self, FrameSource, SequenceInfo};
 use crate::stages::quantise::QuantiseError;
 use crate::stages::select::{SelectedGrid, Selection, find, select};
-use crate::stages::serialise::{FrameInput, GridInput, SerialiseError, serialise};
-use crate::vdb::{GridClass, VdbFile};
+use crate::stages::serialise::{FrameInput, GridInput, SerialiseError, serialise, tree_bytes};
+use crate::vdb::{GridClass, VdbFile, voxel_size};
 use crate::verify::{self, PictureSettings, Sources, VerifyReport};
 
 /// How much a finished pack is checked.
@@ -105,12 +105,12 @@ pub fn build(job: &Job, progress: &mut dyn Progress) -> Result<Outcome> {
     let trees = flatten_and_dedup(&sequence, &selection, &job.settings, progress)?;
     clock.lap("flatten and dedup");
 
-    let mut grids = selection
-        .grids
-        .iter()
-        .zip(trees)
-        .map(|(grid, tree)| grid_input(&sequence, grid, tree, &job.settings))
-        .collect::<Result<Vec<_>>>()?;
+    let each = selection.grids.iter().zip(trees);
+    let mut grids: Vec<GridInput> =
+        each.map(|(grid, tree)| grid_input(&sequence, grid, tree, &job.settings)).collect();
+    allocate_all(&mut grids, &job.settings, progress)?;
+    clock.lap("allocate");
+
     let provenance = provenance(&sequence, &job.settings);
     let bricks: u64 = grids.iter().map(|g| u64::from(g.tree.pool.len())).sum();
     progress.stage("encode", bricks, "bricks");
@@ -270,31 +270,76 @@ fn grid_input(
     grid: &SelectedGrid,
     tree: SequenceTree,
     settings: &Settings,
-) -> Result<GridInput> {
+) -> GridInput {
     let frames = grid.frames.iter().map(|&i| {
         let frame = &sequence.frames[i];
         let info = find(&frame.grids, &grid.name).expect("the grid was selected in this frame");
         let transform = info.transform.matrix.expect("the grid was selected for its linear map");
         FrameInput { number: frame.number, source: i as u32, transform }
     });
-    let allocation = allocate(&tree, settings.format, settings.range).ok_or_else(|| {
-        Error::Input(format!(
-            "grid {:?}: its values span more than an f32 can hold: scale the grid down before the export",
-            grid.name
-        ))
-    })?;
-    Ok(GridInput {
+    GridInput {
         name: grid.name.clone(),
         class: grid.class,
         fps: settings.fps.unwrap_or(0.0),
         frames: frames.collect(),
         tree,
-        allocation,
-    })
+        allocation: Allocation::default(),
+    }
+}
+
+/// Decides how the bricks of every grid are coded.
+fn allocate_all(grids: &mut [GridInput], settings: &Settings, progress: &mut dyn Progress) -> Result<()> {
+    let scratch = |e| Error::io(std::env::temp_dir())(e);
+    let too_wide = |name: &str| {
+        Error::Input(format!(
+            "grid {name:?}: its values span more than an f32 can hold: scale the grid down before the export",
+        ))
+    };
+    if let Some(codec) = settings.format.codec() {
+        for grid in grids {
+            let allocation = allocate::uniform(&grid.tree, codec, settings.range);
+            grid.allocation = allocation.ok_or_else(|| too_wide(&grid.name))?;
+        }
+        return Ok(());
+    }
+    if settings.clustering.is_some() {
+        return Err(Error::Usage(
+            "clustering by k-means goes with one codec for all bricks, such as format = \"bc7\": \
+             the adaptive format promises a quality that clusters know nothing of"
+                .to_owned(),
+        ));
+    }
+    let target = Target {
+        quality: settings.quality,
+        min_frame_psnr: settings.min_frame_psnr,
+        range: settings.range,
+        fixed_bytes: tree_bytes(grids).map_err(|e| Error::Unsupported(e.to_string()))?,
+    };
+    let bricks: u64 = grids.iter().map(|g| u64::from(g.tree.pool.len())).sum();
+    progress.stage("allocate", bricks, "bricks");
+    let mut candidates: Vec<AdaptiveGrid> = grids.iter_mut().map(adaptive_grid).collect();
+    let allocations = allocate::adaptive(&mut candidates, &target, &mut |bricks| progress.advance(bricks));
+    let allocations = allocations.map_err(|e| match e {
+            AllocateError::Io(source) => scratch(source),
+            AllocateError::TooWide { grid } => too_wide(&grids[grid].name),
+            AllocateError::TooSmall { .. } => Error::Usage(e.to_string()),
+        })?;
+    grids.iter_mut().zip(allocations).for_each(|(grid, allocation)| grid.allocation = allocation);
+    Ok(())
+}
+
+fn adaptive_grid(grid: &mut GridInput) -> AdaptiveGrid<'_> {
+    let voxel_size = grid.frames.iter().map(|f| voxel_size(&f.transform)).fold(f64::INFINITY, f64::min);
+    let is_level_set = grid.class == GridClass::LevelSet;
+    AdaptiveGrid {
+        sign_matters: is_level_set.then_some(verify::SIGN_MATTERS_VOXELS * voxel_size),
+        voxel_size,
+        tree: &mut grid.tree,
+    }
 }
 
 fn provenance(sequence: &SequenceInfo, settings: &Settings) -> Provenance {
-    let uses_block_encoder = matches!(settings.format, Format::Bc4 | Format::Bc7);
+    let uses_block_encoder = matches!(settings.format, Format::Bc4 | Format::Bc7 | Format::Adaptive);
     Provenance {
         tool: env!("CARGO_PKG_NAME").to_owned(),
         version: env!("CARGO_PKG_VERSION").to_owned(),

@@ -98,7 +98,7 @@ fn jobs(args: &BuildArgs) -> Result<Vec<(String, Result<Job>)>> {
             .as_deref()
             .ok_or_else(|| Error::Usage("FILES need a pack to go into: add -o OUT.volpack".to_owned()))?;
         let name = output.file_stem().map_or_else(|| "pack".into(), |s| s.to_string_lossy().into_owned());
-        return Ok(vec![(name, Ok(job(expand(&args.frames)?, output, args.settings.settings(), None)))]);
+        return Ok(vec![(name, Ok(job(expand(&args.frames)?, output, args.settings.settings()?, None)))]);
     }
     if args.output.is_some() || args.settings.any() {
         return Err(Error::Usage(

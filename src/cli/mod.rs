@@ -14,7 +14,9 @@ use clap::{Args, Parser, Subcommand};
 use crate::error::{Error, Result};
 use crate::pipeline::VerifyLevel;
 use crate::render::Device;
-use crate::settings::{DEFAULT_ZSTD, Format, Masks, NonFinite, RangeMode, Settings};
+use crate::settings::{
+    ClusterArgs, DEFAULT_ZSTD, Format, Masks, NonFinite, QualityArgs, RangeMode, Settings,
+};
 use crate::verify::PictureSettings;
 
 const EXIT_CODES: &str = "\
@@ -69,9 +71,13 @@ struct SettingsArgs {
     /// A grid to pack; may be given more than once [default: density, else the only scalar grid]
     #[arg(short, long = "grid", value_name = "NAME")]
     grids: Vec<String>,
-    /// How bricks are stored [default: unorm8]
+    /// How bricks are stored [default: adaptive]
     #[arg(short, long)]
     format: Option<Format>,
+    #[command(flatten)]
+    quality: QualityArgs,
+    #[command(flatten)]
+    clusters: ClusterArgs,
     /// What the 0 and 1 of unorm8, bc4 and bc7 texels stand for [default: brick]
     #[arg(short, long)]
     range: Option<RangeMode>,
@@ -97,22 +103,28 @@ fn positive(text: &str) -> std::result::Result<f32, String> {
 }
 
 impl SettingsArgs {
-    fn settings(&self) -> Settings {
-        Settings {
+    fn settings(&self) -> Result<Settings> {
+        let format = self.format.unwrap_or_default();
+        Ok(Settings {
             grids: self.grids.clone(),
-            format: self.format.unwrap_or_default(),
+            format,
+            quality: self.quality.quality(format).map_err(Error::Usage)?,
+            min_frame_psnr: self.quality.min_frame_psnr,
+            clustering: self.clusters.clustering().map_err(Error::Usage)?,
             range: self.range.unwrap_or_default(),
             masks: self.masks.unwrap_or_default(),
             nonfinite: self.nonfinite.unwrap_or_default(),
             zstd: self.zstd.unwrap_or(DEFAULT_ZSTD),
             fps: self.fps,
-        }
+        })
     }
 
     /// Whether any is given.
     fn any(&self) -> bool {
         !self.grids.is_empty()
             || self.format.is_some()
+            || self.quality != QualityArgs::default()
+            || self.clusters != ClusterArgs::default()
             || self.range.is_some()
             || self.masks.is_some()
             || self.nonfinite.is_some()

@@ -3,32 +3,137 @@
 //! Only the palette of 8 values is used (first endpoint above the second): GPUs disagree about the
 //! one of 6 by up to 7/255 of the endpoints' distance.
 
-use intel_tex_2::RSurface;
+//!
+//! The encoder is ours because it works on the values themselves: a block whose values lie within a few 255ths of a
+//! brick's range has palette steps finer than that, which an encoder of bytes cannot use. It is 3 to 6 dB nearer to
+//! smooth bricks than intel_tex_2's (docs/decisions/0007-own-bc4-encoder.md).
 
-use super::blocks::by_slice;
-use super::plain::{texel_order, texel_order_mut, unorm8};
+use super::plain::{texel_order, texel_order_mut};
 use super::{SequenceRange, Texels};
 use crate::volume::BRICK_VOXELS;
 
 const BLOCK: usize = 8;
-/// Texels across the surface of one brick: its 8 slices side by side, the encoder's least width.
-const WIDTH: usize = 64;
+/// Texels of a block.
+const TEXELS: usize = 16;
+/// Steps between a block's endpoints.
+const STEPS: f32 = 7.0;
 
 pub(super) fn encode(sequence: &SequenceRange, batch: &[Texels]) -> Vec<u8> {
-    let width = WIDTH * batch.len();
-    let mut surface = vec![0u8; width * 8];
-    for (b, brick) in batch.iter().enumerate() {
-        for ((z, y, x), &v) in texel_order(&brick.values).indexed_iter() {
-            surface[y * width + b * WIDTH + z * 8 + x] = unorm8(sequence, brick, v);
+    let mut out = Vec::with_capacity(batch.len() * BRICK_VOXELS / TEXELS * BLOCK);
+    for brick in batch {
+        let codes: [f32; BRICK_VOXELS] =
+            std::array::from_fn(|i| sequence.normalise(brick.range, brick.values[i]) * 255.0);
+        let weights: [f32; BRICK_VOXELS] =
+            std::array::from_fn(|i| if brick.carried.get(i) { 1.0 } else { 0.0 });
+        let (codes, weights) = (texel_order(&codes), texel_order(&weights));
+        for block in 0..BRICK_VOXELS / TEXELS {
+            let (z, by, bx) = (block / 4, block / 2 % 2, block % 2);
+            let at = |t: usize| [z, by * 4 + t / 4, bx * 4 + t % 4];
+            out.extend(
+                Block { codes: std::array::from_fn(|t| codes[at(t)]), weights: std::array::from_fn(|t| weights[at(t)]) }
+                    .encode(),
+            );
         }
     }
-    let blocks = intel_tex_2::bc4::compress_blocks(&RSurface {
-        data: &surface,
-        width: width as u32,
-        height: 8,
-        stride: width as u32,
-    });
-    by_slice(&blocks, width, BLOCK, batch.len() * 8)
+    out
+}
+
+/// One block's texels as 255ths, and how much each counts.
+struct Block {
+    codes: [f32; TEXELS],
+    weights: [f32; TEXELS],
+}
+
+impl Block {
+    fn encode(&self) -> [u8; BLOCK] {
+        let carried = || (0..TEXELS).filter(|&t| self.weights[t] > 0.0).map(|t| self.codes[t]);
+        let low = carried().fold(f32::INFINITY, f32::min);
+        let high = carried().fold(f32::NEG_INFINITY, f32::max);
+        if low > high {
+            return [0; BLOCK];
+        }
+        let mut best = (f32::INFINITY, [0u8; 2]);
+        let mut consider = |high: f32, low: f32| {
+            let ends = [high.clamp(0.0, 255.0) as u8, low.clamp(0.0, 255.0) as u8];
+            // Endpoints in this order select the palette of eight values.
+            if ends[0] > ends[1] {
+                let error = self.error(ends);
+                if error < best.0 {
+                    best = (error, ends);
+                }
+            }
+        };
+        consider(high.ceil().max(low.floor() + 1.0), low.floor());
+        consider(high.ceil(), (low.floor()).min(high.ceil() - 1.0));
+        // Values that fill their range evenly are best served by ends a sixteenth of it further in.
+        let inset = (high - low) / 16.0;
+        let mut ends = [high - inset, low + inset];
+        for _ in 0..2 {
+            ends = self.fit(ends);
+            for high in [ends[0].floor(), ends[0].ceil()] {
+                for low in [ends[1].floor(), ends[1].ceil()] {
+                    consider(high, low);
+                }
+            }
+        }
+        let ends = best.1;
+        let mut bits = 0u64;
+        for (t, place) in self.places(ends.map(f32::from)).into_iter().enumerate() {
+            // Index 0 is the first endpoint, 1 the second, and 2 to 7 lie between in that order.
+            let index = match place as u64 {
+                7 => 0,
+                0 => 1,
+                place => 8 - place,
+            };
+            bits |= index << (3 * t);
+        }
+        let mut out = [0; BLOCK];
+        out[..2].copy_from_slice(&ends);
+        out[2..].copy_from_slice(&bits.to_le_bytes()[..6]);
+        out
+    }
+
+    /// How many steps above the lower end each texel's nearest palette entry is.
+    fn places(&self, [high, low]: [f32; 2]) -> [f32; TEXELS] {
+        let scale = STEPS / (high - low);
+        self.codes.map(|code| ((code - low) * scale + 0.5).floor().clamp(0.0, STEPS))
+    }
+
+    fn error(&self, ends: [u8; 2]) -> f32 {
+        let [high, low] = ends.map(f32::from);
+        let places = self.places([high, low]);
+        let step = (high - low) / STEPS;
+        let mut sum = 0.0;
+        for t in 0..TEXELS {
+            let error = low + step * places[t] - self.codes[t];
+            sum += self.weights[t] * error * error;
+        }
+        sum
+    }
+
+    /// The ends for which the places that `ends` give are best: a least-squares line.
+    fn fit(&self, ends: [f32; 2]) -> [f32; 2] {
+        if ends[0] - ends[1] < 1e-3 {
+            return ends;
+        }
+        let places = self.places(ends);
+        let [mut n, mut sx, mut sxx, mut sy, mut sxy] = [0.0f32; 5];
+        for t in 0..TEXELS {
+            let (w, x, y) = (self.weights[t], places[t] / STEPS, self.codes[t]);
+            n += w;
+            sx += w * x;
+            sxx += w * x * x;
+            sy += w * y;
+            sxy += w * x * y;
+        }
+        let determinant = n * sxx - sx * sx;
+        if determinant < 1e-6 {
+            return ends;
+        }
+        let slope = (n * sxy - sx * sy) / determinant;
+        let low = (sy - slope * sx) / n;
+        [low + slope, low]
+    }
 }
 
 pub(super) fn decode(bytes: &[u8], out: &mut [f32; BRICK_VOXELS]) {
@@ -40,6 +145,19 @@ pub(super) fn decode(bytes: &[u8], out: &mut [f32; BRICK_VOXELS]) {
         for (t, texel) in texels.into_iter().enumerate() {
             out[[z, by * 4 + t / 4, bx * 4 + t % 4]] = texel;
         }
+    }
+}
+
+/// How far a GPU's reading of each voxel may be from [`decode`]'s, before the brick's range is applied.
+///
+/// Measured on an NVIDIA H200 and on Mesa's software Vulkan: up to 2.84/255 of the distance of a block's
+/// endpoints for the palette of 8 values. 0.03 of it and one step of 255 is above both.
+pub(super) fn spread(bytes: &[u8], out: &mut [f32; BRICK_VOXELS]) {
+    let mut out = texel_order_mut(out);
+    for (i, block) in bytes.as_chunks::<BLOCK>().0.iter().enumerate() {
+        let (z, by, bx) = (i / 4, i / 2 % 2, i % 2);
+        let spread = (0.03 * f32::from(block[0].abs_diff(block[1])) + 1.0) / 255.0;
+        out.slice_mut(ndarray::s![z, by * 4..by * 4 + 4, bx * 4..bx * 4 + 4]).fill(spread);
     }
 }
 

@@ -191,6 +191,30 @@ pub fn decode(
     out
 }
 
+/// How far a GPU's arithmetic may be from [`decode`]'s, of the largest number in it: `lo + span · (m + e · t)` is
+/// four roundings of 2⁻²⁴, and as many again where a compiler contracts it otherwise.
+const ARITHMETIC: f32 = 8.0 / (1 << 24) as f32;
+
+/// For each voxel, how far what a GPU reads may be from what [`decode`] gives, in the grid's units.
+pub fn spread(
+    codec: Codec,
+    bytes: &[u8],
+    sequence: &SequenceRange,
+    range: BrickRange,
+) -> Box<[f32; BRICK_VOXELS]> {
+    let mut out = Box::new([0.0; BRICK_VOXELS]);
+    if codec == Codec::Bc4 {
+        bc4::spread(bytes, &mut out);
+        let extent = sequence.span * range.extent.to_f32();
+        out.iter_mut().for_each(|s| *s *= extent);
+    }
+    if codec.is_normalised() {
+        let arithmetic = ARITHMETIC * (sequence.lo.abs() + sequence.span);
+        out.iter_mut().for_each(|s| *s += arithmetic);
+    }
+    out
+}
+
 /// The instruction set that `intel_tex_2` picks on this machine. Its SSE and AVX paths differ in a
 /// few blocks of ten thousand, so this belongs wherever bytes are promised to be the same.
 pub fn encoder_isa() -> &'static str {

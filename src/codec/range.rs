@@ -44,6 +44,13 @@ impl BrickRange {
 /// widen a range by at most 1/16 at either end.
 const SIGNIFICANT_BITS: i32 = 5;
 
+impl Default for SequenceRange {
+    /// That of no values.
+    fn default() -> Self {
+        Self { lo: 0.0, span: 1.0 }
+    }
+}
+
 impl SequenceRange {
     /// The range to use for values from `min` to `max`; `None` if it is wider than an `f32`.
     pub fn around(min: f32, max: f32) -> Option<Self> {

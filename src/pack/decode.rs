@@ -1,11 +1,11 @@
 //! Reads one frame back: from coordinates to regions, from L3 records to voxels.
 
 use std::borrow::Cow;
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 
 use super::tree::{self, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS, header, l1_words};
 use super::{Frame, Grid, Pack, PackError};
-use crate::codec::{BrickRange, Codec, decode};
+use crate::codec::{BrickRange, Codec, decode, spread};
 use crate::volume::{
     BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, CoordBox, InactiveRule, Mask512, ROOT_DIM,
 };
@@ -60,6 +60,25 @@ impl Pack {
             return Err(PackError::Corrupt(format!("frame {frame} lists chunks that are not texels")));
         }
         Ok(FrameReader { pack: self, grid, frame, slabs })
+    }
+
+    /// Whether bricks of different ranges use the texels of a record: they suit neither one exactly.
+    pub fn is_shared(&self, record: &L3Record) -> bool {
+        let shared = self.shared.get_or_init(|| {
+            let words = &self.tree;
+            let records = words[words[header::RECORD_AT] as usize..].as_chunks::<RECORD_WORDS>().0;
+            let mut ranges = HashMap::new();
+            let mut shared = HashSet::new();
+            for words in &records[..words[header::RECORDS] as usize] {
+                let Some(record) = L3Record::from_words(*words) else { continue };
+                let slot = (record.codec, record.slot);
+                if record.codec != Codec::Constant && *ranges.entry(slot).or_insert(record.word2) != record.word2 {
+                    shared.insert(slot);
+                }
+            }
+            shared
+        });
+        shared.contains(&(record.codec, record.slot))
     }
 
     /// One frame's tree without its texels: regions can be found, bricks not decoded.
@@ -254,6 +273,23 @@ impl FrameReader<'_> {
             values[i] = if minus.get(i) { -background } else { background };
         }
         Ok(DecodedBrick { values, active })
+    }
+
+    /// [`Pack::is_shared`].
+    pub fn is_shared(&self, record: &L3Record) -> bool {
+        self.pack.is_shared(record)
+    }
+
+    /// For each voxel of a record, how far what a GPU reads may be from [`FrameReader::decode`].
+    ///
+    /// # Errors
+    /// When its texels are not among the chunks that the frame lists.
+    pub fn spread(&self, record: &L3Record) -> Result<Box<[f32; BRICK_VOXELS]>, PackError> {
+        if record.codec == Codec::Constant {
+            return Ok(Box::new([0.0; BRICK_VOXELS]));
+        }
+        let range = BrickRange::from_word(record.word2);
+        Ok(spread(record.codec, &self.texels(record)?, &self.grid().sequence, range))
     }
 
     fn texels(&self, record: &L3Record) -> Result<Vec<u8>, PackError> {

@@ -146,6 +146,9 @@ pub struct GridRecord {
     pub active_min: f32,
     /// The greatest active value of the source.
     pub active_max: f32,
+    /// What each codec cost, by tag: the root of the sum of squared errors over every voxel of its
+    /// bricks that no rule gives, over all frames.
+    pub codec_norms: [f32; 6],
 }
 
 /// One frame of one grid.
@@ -197,7 +200,7 @@ const _: () = {
     assert!(size_of::<Header>() == 64);
     assert!(size_of::<Section>() == 80);
     assert!(size_of::<Chunk>() == 48);
-    assert!(size_of::<GridRecord>() == 32);
+    assert!(size_of::<GridRecord>() == 56);
     assert!(size_of::<FrameRecord>() == 192);
     assert!(size_of::<AtlasRecord>() == 24);
 };

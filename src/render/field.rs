@@ -77,8 +77,7 @@ impl Field {
                             Child::Constant(constant) => field.put_region(origin, constant),
                             Child::Brick(i) => {
                                 let brick = bricks[i as usize].take().expect("each brick is named once");
-                                let mask = brick.mask.expect("bricks of the source have their masks");
-                                field.put_brick(origin, Box::new(brick.values), mask);
+                                field.put_brick(origin, Box::new(brick.values), brick.active);
                             }
                         }
                     }

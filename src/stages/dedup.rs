@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use crate::stages::flatten::Flattened;
 use crate::volume::{
     Brick, BrickPool, CellContent, Child, Constant, Coord, FrameStats, InactiveRule, Interner, Mask512,
-    ValueRange,
+    ValueRange, bits,
 };
 
 /// Whether bricks keep their active masks.
@@ -149,10 +149,8 @@ impl Prepared {
             MaskPolicy::DropWhereBackground => true,
             MaskPolicy::DropFog => background == 0.0,
         };
-        if drop && rule == InactiveRule::Background {
-            brick.mask = None;
-        }
-        let rule = if brick.mask.is_none() { InactiveRule::Texel } else { rule };
+        brick.keeps_mask = !(drop && rule == InactiveRule::Background);
+        let rule = if brick.keeps_mask { rule } else { InactiveRule::Texel };
         let range = brick.range_over(&carried(&brick, rule)).map(|(min, max)| ValueRange { min, max });
         let hash = BrickPool::hash(&brick);
         Self { brick, rule, minus, range, hash }
@@ -174,9 +172,9 @@ impl Prepared {
 
 /// The voxels whose values texels have to give: all but those that a rule gives.
 pub fn carried(brick: &Brick, rule: InactiveRule) -> Mask512 {
-    match (&brick.mask, rule) {
-        (Some(mask), InactiveRule::Background | InactiveRule::MinusBackground | InactiveRule::Sign) => *mask,
-        _ => Mask512::ALL,
+    match rule {
+        InactiveRule::Background | InactiveRule::MinusBackground | InactiveRule::Sign => brick.active,
+        InactiveRule::Texel => Mask512::ALL,
     }
 }
 
@@ -278,9 +276,9 @@ impl SequenceTree {
         if let Some((id, false)) = brick {
             return Ok(self.record_of_brick[id as usize]);
         }
-        let mask = prepared.brick.mask.map(|mask| match prepared.rule {
-            InactiveRule::Sign => self.masks.intern(&[mask, prepared.minus]),
-            _ => self.masks.intern(&[mask]),
+        let mask = prepared.brick.keeps_mask.then(|| match prepared.rule {
+            InactiveRule::Sign => self.masks.intern(&[prepared.brick.active, prepared.minus]),
+            _ => self.masks.intern(&[prepared.brick.active]),
         });
         let rule = prepared.rule;
         Ok(match (constant, brick) {
@@ -294,6 +292,53 @@ impl SequenceTree {
             }
             (None, None) => unreachable!("a brick that is not constant is in the pool"),
         })
+    }
+
+    /// The inactive rule of each brick of the pool.
+    pub fn brick_rules(&self) -> Vec<InactiveRule> {
+        // Records of bricks are made in the order of the pool.
+        let of_brick = self.records.iter().filter(|r| matches!(r.payload, Payload::Brick(_)));
+        of_brick.map(|r| r.rule).collect()
+    }
+
+    /// The bricks of the pool that a frame uses, shared ones each time.
+    pub fn frame_bricks<'a>(&'a self, frame: &'a FrameTree) -> impl Iterator<Item = u32> + 'a {
+        let nodes = frame.cells.iter().filter_map(|(_, content)| match content {
+            CellRef::Node(node) => Some(&self.nodes.items()[*node as usize]),
+            CellRef::Constant(_) => None,
+        });
+        let records = nodes.flat_map(|node| node.entries(&self.runs)).map(|&r| &self.records[r as usize]);
+        records.filter_map(|record| match record.payload {
+            Payload::Brick(id) => Some(id),
+            Payload::Constant(_) => None,
+        })
+    }
+
+    /// Takes bricks out of the tree: what was there is background then. Nodes without a child go too.
+    pub fn prune(&mut self, is_empty: impl Fn(u32) -> bool) {
+        let (nodes, runs) = (std::mem::take(&mut self.nodes), std::mem::take(&mut self.runs));
+        let mut moved: Vec<Option<u32>> = Vec::with_capacity(nodes.items().len());
+        let mut run = Vec::new();
+        for node in nodes.items() {
+            let mut left = Node { children: [0; 64], run: 0 };
+            run.clear();
+            for (place, &record) in bits(&node.children).zip(node.entries(&runs)) {
+                if !matches!(self.records[record as usize].payload, Payload::Brick(id) if is_empty(id)) {
+                    left.children[place >> 6] |= 1 << (place & 63);
+                    run.push(record);
+                }
+            }
+            moved.push((!run.is_empty()).then(|| {
+                left.run = self.runs.intern(&run).into();
+                self.nodes.intern(&[left])
+            }));
+        }
+        for frame in &mut self.frames {
+            frame.cells.retain_mut(|(_, content)| match content {
+                CellRef::Constant(_) => true,
+                CellRef::Node(node) => moved[*node as usize].inspect(|to| *node = *to).is_some(),
+            });
+        }
     }
 
     /// The range of everything that is active or carried by a texel; `None` for an empty sequence.

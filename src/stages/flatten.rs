@@ -95,6 +95,7 @@ fn flatten_tree<T: Scalar>(tree: &Tree<T>, nonfinite: NonFinite) -> Flattened {
     let stats = FrameStats {
         leaves: topology.leaves,
         active_voxels: topology.active_voxels,
+        active_leaf_voxels: tree.leaves.masks.iter().map(|m| u64::from(m.count())).sum(),
         bbox: topology.bbox,
         active_range: ValueRange::union_all(leaf_range.into_iter().chain(f.active_range)),
         nonfinite: f.nonfinite_count + summaries.iter().map(|s| s.nonfinite).sum::<u64>(),
@@ -165,7 +166,7 @@ fn finite(value: f32, nonfinite: NonFinite) -> f32 {
 fn brick<T: Scalar>(tree: &Tree<T>, leaf: usize, nonfinite: NonFinite) -> Brick {
     let source = tree.leaves.values(leaf);
     let values = std::array::from_fn(|i| finite(source[i].to_f32(), nonfinite));
-    Brick { values, mask: Some(tree.leaves.masks[leaf]) }
+    Brick { values, active: tree.leaves.masks[leaf], keeps_mask: true }
 }
 
 fn summarise<T: Scalar>(brick: &Brick, tree: &Tree<T>, leaf: usize, background: f32) -> LeafSummary {

@@ -1,28 +1,24 @@
 //! Stage 7: texels to the bytes of a codec, slab by slab.
 
 use std::io;
-use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::allocate::Allocation;
-use super::dedup::{Payload, SequenceTree, carried};
-use super::relayout;
+use super::allocate::{Allocation, Coding};
+use super::dedup::{SequenceTree, carried};
+use super::relayout::{self, PlannedAtlas, Texture, TextureOf};
 use crate::codec::{Codec, OutOfRange, Texels, decode, encode};
-use crate::pack::Atlas;
 use crate::volume::{Brick, InactiveRule};
 
 /// Bricks that are in memory at once: 8 MB of voxels, enough batches for every core.
 const BRICKS_IN_FLIGHT: u32 = 4096;
 
-/// One grid's bricks and where they begin in the atlas.
+/// One grid's bricks and how they are coded.
 pub struct GridBricks<'a> {
     /// The grid.
     pub tree: &'a mut SequenceTree,
     /// Its codecs and ranges.
-    pub allocation: &'a Allocation,
-    /// The slot of the first brick of its pool; the others follow.
-    pub first_slot: u32,
+    pub allocation: &'a mut Allocation,
 }
 
 /// The slabs cannot be encoded.
@@ -42,114 +38,170 @@ pub enum QuantiseError {
 }
 
 /// What became of each brick of a grid.
-#[derive(Default)]
 pub struct Outcome {
     /// Its packing axis.
     pub axes: Vec<u8>,
-    /// The squared error over the voxels that its texels give, on the decoded value.
-    pub squares: Vec<f64>,
+    /// The root of the squared error over the voxels that its texels give, on the decoded value.
+    pub norms: Vec<f32>,
 }
 
-/// The bricks of one slab that come from one grid.
-struct Part {
-    grid: usize,
-    first: u32,
-    bricks: Vec<Brick>,
+impl Outcome {
+    /// What is known before any slab is encoded: constants and shapes.
+    pub fn before(allocation: &Allocation) -> Self {
+        let axis = |coding: &Coding| match *coding {
+            Coding::Shared(shape) => allocation.shapes[shape as usize].axis,
+            _ => 2,
+        };
+        Self { axes: allocation.codings.iter().map(axis).collect(), norms: allocation.norms.clone() }
+    }
 }
 
-/// Encodes every slab of `atlas` in order. `finish` is applied to a slab's bytes on the thread that made
-/// them, `sink` to the results in order. Returns what became of each grid's bricks.
+/// The contents of some slots before they are encoded.
+enum Run {
+    /// One slot's bytes, which are there already, and their packing axis.
+    Encoded(Vec<u8>, u8),
+    /// Bricks of one grid that follow each other in its pool, from this one on.
+    Bricks(u32, Vec<Brick>),
+}
+
+/// One brick's texels, encoded.
+struct Encoded {
+    bytes: Vec<u8>,
+    axis: u8,
+    /// Root of the squared error; `None` where it was known before.
+    norm: Option<f32>,
+}
+
+/// Encodes every slab of an atlas in order. `finish` is applied to a slab's bytes on the thread that made
+/// them, `sink` to the results in order. What becomes of each grid's bricks goes into `outcomes`.
 ///
 /// # Errors
 /// [`QuantiseError`].
 pub fn quantise<T: Send>(
-    atlas: &Atlas,
+    planned: &PlannedAtlas,
     grids: &mut [GridBricks],
+    outcomes: &mut [Outcome],
     finish: impl Fn(Vec<u8>) -> io::Result<T> + Sync,
     mut sink: impl FnMut(T) -> io::Result<()>,
-) -> Result<Vec<Outcome>, QuantiseError> {
-    let rules: Vec<Vec<InactiveRule>> = grids.iter().map(|g| brick_rules(g.tree)).collect();
-    let mut outcomes: Vec<Outcome> = grids.iter().map(|_| Outcome::default()).collect();
+) -> Result<(), QuantiseError> {
+    let atlas = &planned.atlas;
+    let rules: Vec<Vec<InactiveRule>> = grids.iter().map(|g| g.tree.brick_rules()).collect();
     let group = (BRICKS_IN_FLIGHT / atlas.slab_bricks()).max(1);
     for first in (0..atlas.slabs).step_by(group as usize) {
-        let slabs = first..(first + group).min(atlas.slabs);
-        let parts = slabs.map(|slab| read_parts(grids, atlas.slots(slab))).collect::<io::Result<Vec<_>>>()?;
+        let slabs: Vec<&[Texture]> = (first..(first + group).min(atlas.slabs))
+            .map(|slab| atlas.slots(slab))
+            .map(|slots| &planned.texels[slots.start as usize..slots.end as usize])
+            .collect();
+        let runs = slabs
+            .iter()
+            .map(|textures| read_runs(grids, atlas.codec, textures))
+            .collect::<io::Result<Vec<_>>>()?;
         let grids = &*grids;
-        let encoded: Vec<_> = parts
+        let encoded: Vec<_> = runs
             .into_par_iter()
-            .map(|parts| {
-                let (bytes, outcomes) = encode_slab(atlas, grids, &rules, parts)?;
-                Ok((finish(relayout::assemble(atlas, &bytes))?, outcomes))
+            .map(|runs| {
+                let encoded = encode_slab(atlas.codec, grids, &rules, runs)?;
+                let bytes: Vec<u8> = encoded.iter().flat_map(|e| &e.bytes).copied().collect();
+                Ok((finish(relayout::assemble(atlas, &bytes))?, encoded))
             })
             .collect::<Result<_, QuantiseError>>()?;
-        for (slab, parts) in encoded {
+        for ((slab, encoded), textures) in encoded.into_iter().zip(&slabs) {
             sink(slab)?;
-            for (grid, part) in parts {
-                outcomes[grid].axes.extend(part.axes);
-                outcomes[grid].squares.extend(part.squares);
+            for (texture, encoded) in textures.iter().zip(encoded) {
+                if let TextureOf::Brick(id) = texture.of {
+                    let outcome = &mut outcomes[texture.grid as usize];
+                    outcome.axes[id as usize] = encoded.axis;
+                    encoded.norm.into_iter().for_each(|norm| outcome.norms[id as usize] = norm);
+                }
             }
         }
     }
-    Ok(outcomes)
+    Ok(())
 }
 
-/// The inactive rule of each brick of the pool.
-fn brick_rules(tree: &SequenceTree) -> Vec<InactiveRule> {
-    // Records of bricks are made in the order of the pool.
-    let of_brick = tree.records.iter().filter(|r| matches!(r.payload, Payload::Brick(_)));
-    of_brick.map(|r| r.rule).collect()
-}
-
-fn read_parts(grids: &mut [GridBricks], slots: Range<u32>) -> io::Result<Vec<Part>> {
-    let mut parts = Vec::new();
-    for (grid, source) in grids.iter_mut().enumerate() {
-        let start = slots.start.max(source.first_slot) - source.first_slot;
-        let end = slots.end.saturating_sub(source.first_slot).min(source.tree.pool.len());
-        if start < end {
-            let mut bricks = Vec::new();
-            source.tree.pool.read(start..end, &mut bricks)?;
-            parts.push(Part { grid, first: start, bricks });
+/// What lies in some slots, each run with its grid: bytes where they are known, else bricks.
+fn read_runs(grids: &mut [GridBricks], codec: Codec, textures: &[Texture]) -> io::Result<Vec<(usize, Run)>> {
+    let follows = |a: &Texture, b: &Texture| match (a.of, b.of) {
+        (TextureOf::Brick(first), TextureOf::Brick(second)) => a.grid == b.grid && first + 1 == second,
+        _ => false,
+    };
+    let mut runs = Vec::new();
+    for run in textures.chunk_by(follows) {
+        let index = run[0].grid as usize;
+        let GridBricks { tree, allocation } = &mut grids[index];
+        let first = match run[0].of {
+            TextureOf::Brick(first) => first,
+            TextureOf::Shape(shape) => {
+                let shape = &allocation.shapes[shape as usize];
+                runs.push((index, Run::Encoded(shape.bytes.clone(), shape.axis)));
+                continue;
+            }
+        };
+        let ids = first..first + run.len() as u32;
+        match allocation.kept.as_mut().filter(|kept| kept.holds(codec)) {
+            Some(kept) => {
+                for id in ids {
+                    let (bytes, axis) = kept.get(id)?;
+                    runs.push((index, Run::Encoded(bytes, axis)));
+                }
+            }
+            None => {
+                let mut bricks = Vec::with_capacity(ids.len());
+                tree.pool.read(ids, &mut bricks)?;
+                runs.push((index, Run::Bricks(first, bricks)));
+            }
         }
     }
-    Ok(parts)
+    Ok(runs)
 }
-
-type PartOutcomes = Vec<(usize, Outcome)>;
 
 fn encode_slab(
-    atlas: &Atlas,
+    codec: Codec,
     grids: &[GridBricks],
     rules: &[Vec<InactiveRule>],
-    parts: Vec<Part>,
-) -> Result<(Vec<u8>, PartOutcomes), QuantiseError> {
-    let mut bytes = Vec::with_capacity(atlas.slab_bytes());
-    let mut outcomes = Vec::new();
-    for Part { grid, first, bricks } in parts {
-        let source = &grids[grid];
-        let texels: Vec<Texels> = bricks
-            .iter()
-            .zip(first as usize..)
-            .map(|(brick, id)| {
-                let carried = carried(brick, rules[grid][id]);
-                let range = source.tree.brick_ranges[id];
-                Texels::new(brick, carried, (range.min, range.max), source.allocation.ranges[id])
-            })
-            .collect();
-        let encoded = encode(atlas.codec, &source.allocation.sequence, &texels)
-            .map_err(|source| QuantiseError::OutOfRange { grid, source })?;
-        let size = atlas.codec.layout().brick_bytes();
-        let each = bricks.iter().zip(&texels).zip(encoded.bytes.chunks_exact(size)).zip(&encoded.axes);
-        let squares = each.map(|(((brick, texels), bytes), &axis)| {
-            if atlas.codec == Codec::F32 {
-                return 0.0;
-            }
-            let decoded = decode(atlas.codec, bytes, axis, &source.allocation.sequence, texels.range);
-            let square = |i: usize| (f64::from(decoded[i]) - f64::from(brick.values[i])).powi(2);
-            texels.carried.ones().map(square).sum()
-        });
-        let squares = squares.collect();
-        bytes.extend(encoded.bytes);
-        outcomes.push((grid, Outcome { axes: encoded.axes, squares }));
+    runs: Vec<(usize, Run)>,
+) -> Result<Vec<Encoded>, QuantiseError> {
+    let mut out = Vec::new();
+    for (grid, run) in runs {
+        match run {
+            Run::Encoded(bytes, axis) => out.push(Encoded { bytes, axis, norm: None }),
+            Run::Bricks(first, bricks) => out.extend(
+                encode_bricks(codec, &grids[grid], &rules[grid], first, &bricks)
+                    .map_err(|source| QuantiseError::OutOfRange { grid, source })?,
+            ),
+        }
     }
-    Ok((bytes, outcomes))
+    Ok(out)
+}
+
+fn encode_bricks(
+    codec: Codec,
+    grid: &GridBricks,
+    rules: &[InactiveRule],
+    first: u32,
+    bricks: &[Brick],
+) -> Result<Vec<Encoded>, OutOfRange> {
+    let sequence = &grid.allocation.sequence;
+    let texels: Vec<Texels> = bricks
+        .iter()
+        .zip(first as usize..)
+        .map(|(brick, id)| {
+            let (carried, range) = (carried(brick, rules[id]), grid.tree.brick_ranges[id]);
+            Texels::new(brick, carried, (range.min, range.max), grid.allocation.ranges[id])
+        })
+        .collect();
+    let encoded = encode(codec, sequence, &texels)?;
+    let size = codec.layout().brick_bytes();
+    let each = bricks.iter().zip(&texels).zip(encoded.bytes.chunks_exact(size)).zip(encoded.axes);
+    let encoded = each.map(|(((brick, texels), bytes), axis)| {
+        let norm = if codec == Codec::F32 {
+            0.0
+        } else {
+            let decoded = decode(codec, bytes, axis, sequence, texels.range);
+            let square = |i: usize| (f64::from(decoded[i]) - f64::from(brick.values[i])).powi(2);
+            texels.carried.ones().map(square).sum::<f64>().sqrt() as f32
+        };
+        Encoded { bytes: bytes.to_vec(), axis, norm: Some(norm) }
+    });
+    Ok(encoded.collect())
 }

@@ -1,7 +1,70 @@
-//! Stage 6: where each brick lies in the pages of a 3-D texture.
+//! Stage 6: where each brick lies in the pages of the codecs' 3-D textures.
 
+use super::allocate::{Allocation, Coding};
 use crate::codec::Codec;
 use crate::pack::{Atlas, MAX_TEXELS};
+
+/// Where every brick of a pack lies.
+pub struct Layout {
+    /// The atlases that have a brick, by their codecs' tags.
+    pub atlases: Vec<PlannedAtlas>,
+    /// For each grid, the slot of each brick of its pool in its codec's atlas; 0 for constants.
+    pub slots: Vec<Vec<u32>>,
+}
+
+/// One codec's atlas and what goes where.
+pub struct PlannedAtlas {
+    /// Its geometry.
+    pub atlas: Atlas,
+    /// What lies in each slot.
+    pub texels: Vec<Texture>,
+}
+
+/// What lies in a slot.
+#[derive(Clone, Copy, Debug)]
+pub struct Texture {
+    /// Whose it is.
+    pub grid: u32,
+    /// A brick of the grid's pool, or one of its shapes.
+    pub of: TextureOf,
+}
+
+/// Whose texels lie in a slot.
+#[derive(Clone, Copy, Debug)]
+pub enum TextureOf {
+    /// One brick's own.
+    Brick(u32),
+    /// A shape's.
+    Shape(u32),
+}
+
+/// Gives each brick its place: in the order of the pools, which is that of first use, so that a frame needs few
+/// slabs. A shape lies where the first brick that uses it would.
+pub fn place(allocations: &[&Allocation]) -> Layout {
+    let mut texels: [Vec<Texture>; Codec::WITH_TEXELS.len()] = Default::default();
+    let mut slots = Vec::new();
+    for (grid, allocation) in allocations.iter().enumerate() {
+        let mut put = |codec: Codec, of| {
+            let texels = &mut texels[codec as usize - 1];
+            texels.push(Texture { grid: grid as u32, of });
+            texels.len() as u32 - 1
+        };
+        let mut shapes: Vec<Option<u32>> = vec![None; allocation.shapes.len()];
+        let place = |(id, coding): (usize, &Coding)| match *coding {
+            Coding::Empty | Coding::Constant(_) => 0,
+            Coding::Own(codec) => put(codec, TextureOf::Brick(id as u32)),
+            Coding::Shared(shape) => *shapes[shape as usize].get_or_insert_with(|| {
+                put(allocation.shapes[shape as usize].codec, TextureOf::Shape(shape))
+            }),
+        };
+        slots.push(allocation.codings.iter().enumerate().map(place).collect());
+    }
+    let planned = Codec::WITH_TEXELS
+        .into_iter()
+        .zip(texels)
+        .map(|(codec, texels)| PlannedAtlas { atlas: plan(codec, texels.len() as u32), texels });
+    Layout { atlases: planned.filter(|a| a.atlas.bricks > 0).collect(), slots }
+}
 
 /// Bricks across a page at most.
 const MAX_COLUMNS: u32 = MAX_TEXELS / 8;

@@ -25,7 +25,7 @@ pub use error::VdbError;
 pub use file::VdbFile;
 pub use grid::{GridClass, GridInfo};
 pub use stats::{TopologyStats, ValueStats};
-pub use transform::Transform;
+pub use transform::{Transform, voxel_size};
 pub use tree::{Accessor, Internal, Leaves, RootTile, Tree};
 pub use value::{Scalar, Value, ValueType, with_scalar_type, with_value_type};
 

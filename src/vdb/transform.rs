@@ -21,12 +21,12 @@ impl Transform {
     pub(super) fn read(c: &mut Cursor) -> Result<Self> {
         read_nested(c, 0)
     }
+}
 
-    /// The length of a voxel's three edges in world units.
-    pub fn voxel_size(&self) -> Option<[f64; 3]> {
-        let m = self.matrix?;
-        Some(std::array::from_fn(|r| m[4 * r..4 * r + 3].iter().map(|v| v * v).sum::<f64>().sqrt()))
-    }
+/// The length of a voxel's shortest edge, in world units.
+pub fn voxel_size(matrix: &[f64; 16]) -> f64 {
+    let edge = |r: usize| matrix[4 * r..4 * r + 3].iter().map(|v| v * v).sum::<f64>().sqrt();
+    edge(0).min(edge(1)).min(edge(2))
 }
 
 fn read_nested(c: &mut Cursor, depth: u32) -> Result<Transform> {

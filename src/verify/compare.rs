@@ -4,15 +4,15 @@ use rayon::prelude::*;
 
 use crate::codec::{BrickRange, Codec};
 use crate::pack::{FrameReader, Region};
-use crate::settings::NonFinite;
-use crate::vdb::{GridClass, GridInfo, Internal, Scalar, Tree};
+use crate::settings::{Format, Masks, NonFinite, Quality, Settings};
+use crate::vdb::{GridClass, GridInfo, Internal, Scalar, Tree, voxel_size};
 use crate::volume::{
     BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, InactiveRule, Mask512, ROOT_DIM, ValueRange,
 };
 
 /// A level set's sign may flip where the surface is nearer than this many voxels: there the sign is
 /// within what any quantisation of the distance moves the surface by.
-const SIGN_MATTERS_VOXELS: f64 = 0.1;
+pub const SIGN_MATTERS_VOXELS: f64 = 0.1;
 
 /// Squared errors of some voxels.
 #[derive(Clone, Copy, Debug, Default)]
@@ -86,7 +86,9 @@ impl FrameError {
 struct Comparison<'a, T> {
     tree: &'a Tree<T>,
     reader: &'a FrameReader<'a>,
-    nonfinite: NonFinite,
+    settings: &'a Settings,
+    /// The error that no voxel may have on any GPU, if that was promised.
+    max_error: Option<f64>,
     /// The distance above which a level set's sign counts; `None` for other grids.
     sign_matters: Option<f64>,
 }
@@ -95,14 +97,21 @@ pub(super) fn compare<T: Scalar>(
     tree: &Tree<T>,
     info: &GridInfo,
     reader: &FrameReader,
-    nonfinite: NonFinite,
+    settings: &Settings,
 ) -> FrameError {
-    let voxel_size = info.transform.voxel_size().map_or(1.0, |s| s.into_iter().fold(f64::INFINITY, f64::min));
+    let voxel_size = info.transform.matrix.as_ref().map_or(1.0, voxel_size);
+    let record = &reader.grid().record;
+    let peak = f64::from(record.active_max) - f64::from(record.active_min);
+    let max_error = match settings.quality {
+        Quality::MaxError(bound) if settings.format == Format::Adaptive => Some(bound.absolute(peak, voxel_size)),
+        _ => None,
+    };
     let is_level_set = reader.grid().record.class == GridClass::LevelSet as u32;
     let c = Comparison {
         tree,
         reader,
-        nonfinite,
+        settings,
+        max_error,
         sign_matters: is_level_set.then_some(SIGN_MATTERS_VOXELS * voxel_size),
     };
     let mut error = FrameError::default();
@@ -124,7 +133,7 @@ impl<T: Scalar> Comparison<'_, T> {
     /// The source's value as the pack should have it.
     fn value(&self, value: T) -> f32 {
         let value = value.to_f32();
-        if value.is_finite() || self.nonfinite == NonFinite::Refuse { value } else { 0.0 }
+        if value.is_finite() || self.settings.nonfinite == NonFinite::Refuse { value } else { 0.0 }
     }
 
     fn check_header(&self, info: &GridInfo, error: &mut FrameError) {
@@ -213,6 +222,49 @@ impl<T: Scalar> Comparison<'_, T> {
         }
     }
 
+    /// What the codec of a region promises of a leaf's voxels.
+    fn contract(&self, region: &Region, leaf: usize) -> Contract {
+        // What is as good as background in a lossy pack without masks needs no record.
+        let drops_masks = match self.settings.masks {
+            Masks::Keep => false,
+            Masks::Drop => true,
+            Masks::Auto => self.sign_matters.is_none() && self.reader.grid().background == 0.0,
+        };
+        let may_be_empty = self.settings.format == Format::Adaptive && drops_masks;
+        let record = match region {
+            Region::Brick(record) => record,
+            Region::Background if may_be_empty => {
+                return Contract { keeps_mask: false, exact_inactive: false, has_record: true, values: Bound::Nothing };
+            }
+            _ => {
+                return Contract { keeps_mask: true, exact_inactive: true, has_record: false, values: Bound::Exact };
+            }
+        };
+        let exact_inactive = record.mask.is_some() && record.rule != InactiveRule::Texel;
+        let sequence = &self.reader.grid().sequence;
+        let span = f64::from(sequence.span);
+        let extent = BrickRange::from_word(record.word2).extent.to_f64() * span;
+        // Room for the arithmetic of decoding, which is in f32.
+        let slack = 1e-6 * (span + f64::from(sequence.lo).abs());
+        let values = match record.codec {
+            _ if self.settings.clustering.is_some() || self.reader.is_shared(record) => Bound::Nothing,
+            Codec::Constant if self.settings.format == Format::Adaptive => {
+                // The value lies between the least and the greatest that it stands for.
+                let (source, mask) = (self.tree.leaves.values(leaf), &self.tree.leaves.masks[leaf]);
+                let carried = (0..BRICK_VOXELS).filter(|&i| mask.get(i) || !exact_inactive);
+                let range = ValueRange::union_all(carried.map(|i| ValueRange::of(self.value(source[i]))));
+                Bound::Within(range.map_or(0.0, |r| f64::from(r.max) - f64::from(r.min)))
+            }
+            Codec::Constant | Codec::F32 => Bound::Exact,
+            Codec::F16 => Bound::Half,
+            // Half a step of 255.
+            Codec::Unorm8 => Bound::Within(extent / 510.0 + slack),
+            // Blocks promise no more than to stay inside the brick's range.
+            Codec::Bc4 | Codec::Bc7 => Bound::Within(extent + slack),
+        };
+        Contract { keeps_mask: record.mask.is_some(), exact_inactive, has_record: true, values }
+    }
+
     fn leaf(&self, leaf: usize) -> FrameError {
         let mut error = FrameError::default();
         let origin = self.tree.leaves.origins[leaf];
@@ -236,7 +288,11 @@ impl<T: Scalar> Comparison<'_, T> {
                 }
             },
         };
-        let contract = Contract::of(&region, self.reader);
+        let contract = self.contract(&region, leaf);
+        let spread = match (&region, self.max_error) {
+            (Region::Brick(record), Some(_)) => self.reader.spread(record).ok(),
+            _ => None,
+        };
         if contract.keeps_mask && active != *mask {
             error.fail(|| format!("the brick at {:?} has other active voxels", origin.0));
         }
@@ -256,6 +312,13 @@ impl<T: Scalar> Comparison<'_, T> {
                 error.fail(|| format!("the sign at {:?} flipped: {ours}, the source has {theirs}", at()));
             } else if !contract.allows(ours, theirs, mask.get(i)) {
                 error.fail(|| format!("the value at {:?} is {ours}, the source has {theirs}", at()));
+            } else if let Some(bound) = self.max_error
+                && contract.is_texel(mask.get(i))
+                && difference.abs() + f64::from(spread.as_ref().map_or(0.0, |s| s[i])) > bound
+            {
+                error.fail(|| {
+                    format!("the value at {:?} is {ours}, the source has {theirs}: past max_error {bound}", at())
+                });
             }
         }
         error
@@ -268,8 +331,8 @@ struct Contract {
     keeps_mask: bool,
     /// Whether inactive voxels come from a rule and must be exact.
     exact_inactive: bool,
-    /// Whether there are texels.
-    has_texels: bool,
+    /// Whether a record gives the values, and not the tree above it.
+    has_record: bool,
     /// How far a voxel's value may be off.
     values: Bound,
 }
@@ -281,36 +344,14 @@ enum Bound {
     Half,
     /// This much, in the grid's units.
     Within(f64),
+    /// Nothing: only the error norm holds.
+    Nothing,
 }
 
 impl Contract {
-    fn of(region: &Region, reader: &FrameReader) -> Self {
-        let Region::Brick(record) = region else {
-            return Self { keeps_mask: true, exact_inactive: true, has_texels: false, values: Bound::Exact };
-        };
-        let span = f64::from(reader.grid().sequence.span);
-        let extent = BrickRange::from_word(record.word2).extent.to_f64() * span;
-        // Room for the arithmetic of decoding, which is in f32.
-        let slack = 1e-6 * (span + f64::from(reader.grid().sequence.lo).abs());
-        let values = match record.codec {
-            Codec::Constant | Codec::F32 => Bound::Exact,
-            Codec::F16 => Bound::Half,
-            // Half a step of 255.
-            Codec::Unorm8 => Bound::Within(extent / 510.0 + slack),
-            // Blocks promise no more than to stay inside the brick's range.
-            Codec::Bc4 | Codec::Bc7 => Bound::Within(extent + slack),
-        };
-        Self {
-            keeps_mask: record.mask.is_some(),
-            exact_inactive: record.mask.is_some() && record.rule != InactiveRule::Texel,
-            has_texels: record.codec != Codec::Constant,
-            values,
-        }
-    }
-
     /// Whether a voxel's value comes from a texel.
     fn is_texel(&self, active: bool) -> bool {
-        self.has_texels && (active || !self.exact_inactive)
+        self.has_record && (active || !self.exact_inactive)
     }
 
     fn allows(&self, ours: f32, theirs: f32, active: bool) -> bool {
@@ -320,6 +361,7 @@ impl Contract {
         }
         match self.values {
             Bound::Exact => exact,
+            Bound::Nothing => true,
             Bound::Half => ours.to_bits() == half::f16::from_f32(theirs).to_f32().to_bits(),
             Bound::Within(bound) => (f64::from(ours) - f64::from(theirs)).abs() <= bound,
         }

@@ -5,6 +5,8 @@ use serde::Serialize;
 use super::PicturesReport;
 use super::compare::{Error, FrameError};
 use crate::pack::Pack;
+use crate::settings::{FRAME_MARGIN_DB, Format, Quality};
+use crate::volume::ValueRange;
 
 /// How far decoded values are from the source's.
 #[derive(Clone, Copy, Debug, Serialize)]
@@ -99,12 +101,40 @@ fn worse(a: Metrics, b: Metrics) -> Metrics {
     if psnr(&b) < psnr(&a) { b } else { a }
 }
 
+/// PSNR is summed in another order here than when bricks were allocated.
+const PSNR_TOLERANCE_DB: f64 = 1e-3;
+
+/// What an adaptive pack promised of its grids and frames and does not keep. The largest error is checked voxel by
+/// voxel.
+fn broken_promises(pack: &Pack, grids: &[GridReport], frames: &[FrameReport]) -> Vec<String> {
+    let settings = &pack.provenance.settings;
+    let Quality::Psnr(asked) = settings.quality else { return Vec::new() };
+    if settings.format != Format::Adaptive {
+        return Vec::new();
+    }
+    let below = |metrics: &Metrics, asked: f64| metrics.psnr.filter(|db| *db < asked - PSNR_TOLERANCE_DB);
+    let of_grids = grids.iter().filter_map(|g| {
+        below(&g.active, asked).map(|db| format!("grid {:?}: {db:.3} dB, {asked} were promised", g.grid))
+    });
+    let floor = settings.min_frame_psnr.unwrap_or(asked - FRAME_MARGIN_DB);
+    let of_frames = frames.iter().filter_map(|f| {
+        let db = below(&f.active, floor)?;
+        Some(format!("grid {:?} frame {}: {db:.3} dB, at least {floor} were promised", f.grid, f.frame))
+    });
+    of_grids.chain(of_frames).collect()
+}
+
 impl VerifyReport {
     /// Sums up the errors of each frame of each grid.
     pub(super) fn new(pack: &Pack, errors: Vec<Vec<FrameError>>) -> Self {
         let (mut grids, mut frames, mut failures) = (Vec::new(), Vec::new(), Vec::new());
         for (grid, errors) in pack.grids.iter().zip(errors) {
-            let peak = super::union(&errors).map_or(0.0, |r| f64::from(r.max) - f64::from(r.min));
+            let range = super::union(&errors);
+            let peak = range.map_or(0.0, |r| f64::from(r.max) - f64::from(r.min));
+            let recorded = ValueRange { min: grid.record.active_min, max: grid.record.active_max };
+            if range.is_some_and(|range| range != recorded) {
+                failures.push(format!("grid {:?}: the grid table's active values are not the source's", grid.name));
+            }
             let (mut active, mut all) = (Error::default(), Error::default());
             for (frame, error) in grid.frames.iter().zip(errors) {
                 active.add(&error.active);
@@ -128,6 +158,7 @@ impl VerifyReport {
                 all: Metrics::new(&all, peak),
             });
         }
+        failures.extend(broken_promises(pack, &grids, &frames));
         let worst_frame = frames
             .iter()
             .filter_map(|f| {

@@ -14,6 +14,7 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
+pub use compare::SIGN_MATTERS_VOXELS;
 pub use metrics::{FrameReport, GridReport, Metrics, VerifyReport, WorstFrame};
 pub use pictures::{PictureReport, PictureSettings, PicturesReport, TracerDifference, pictures};
 
@@ -99,7 +100,7 @@ fn match_sources(pack: &Pack, sources: &[PathBuf]) -> Result<Vec<PathBuf>> {
 /// Compares the frames that one source file holds: grid, frame, and what differs.
 fn compare_source(pack: &Pack, source: usize, path: &Path) -> Result<Vec<(usize, usize, FrameError)>> {
     let file = VdbFile::open(path).map_err(Error::vdb(path))?;
-    let nonfinite = pack.provenance.settings.nonfinite;
+    let settings = &pack.provenance.settings;
     let mut out = Vec::new();
     for (g, grid) in pack.grids.iter().enumerate() {
         let of_source = |f: &crate::pack::Frame| f.record.source as usize == source;
@@ -117,7 +118,7 @@ fn compare_source(pack: &Pack, source: usize, path: &Path) -> Result<Vec<(usize,
             let error = with_scalar_type!(&info.value_type,
                 T => {
                     let tree = file.read_tree::<T>(info).map_err(Error::vdb(path))?;
-                    compare(&tree, info, &reader, nonfinite)
+                    compare(&tree, info, &reader, settings)
                 },
                 other => return Err(Error::Verify(format!(
                     "{}: grid {:?} is {} in the file", path.display(), grid.name, other.name()

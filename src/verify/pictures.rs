@@ -9,12 +9,13 @@ use std::path::{Path, PathBuf};
 use serde::Serialize;
 
 use super::Sources;
+use crate::codec::Codec;
 use crate::error::{Error, Result};
 use crate::pack::Pack;
 use crate::render::{
     Device, Difference, Field, Image, Mode, Renderer, Scene, View, difference, trace, write_png,
 };
-use crate::settings::Format;
+use crate::settings::{DEFAULT_PSNR, Format, Quality, Settings};
 use crate::stages::flatten::flatten;
 use crate::stages::select::find;
 use crate::vdb::{GridClass, VdbFile};
@@ -82,14 +83,26 @@ pub struct TracerDifference {
     pub largest: f32,
 }
 
-/// The mean FLIP that a format may cost. Twice to three times what the worst of nine real volumes
-/// costs (docs/benchmarks/pictures.md), so that a pack past it is odd.
-fn default_max_flip(format: Format) -> f64 {
-    match format {
-        Format::F32 => 0.001,
-        Format::F16 => 0.001,
-        Format::Unorm8 => 0.006,
-        Format::Bc4 | Format::Bc7 => 0.04,
+/// The mean FLIP that a pack may cost. Twice to three times what the worst of nine real volumes
+/// costs (docs/benchmarks/pictures.md), so that a pack past it is odd. What an adaptive pack was asked for says how
+/// much it may cost; where that is a size, nothing is promised of its pictures.
+fn default_max_flip(settings: &Settings) -> f64 {
+    /// The most that FLIP gives.
+    const ANYTHING: f64 = 1.0;
+    /// At 45 dB; six decibels less are twice the error.
+    const AT_DEFAULT_PSNR: f64 = 0.02;
+    let at_psnr = |db: f64| (AT_DEFAULT_PSNR * ((DEFAULT_PSNR - db) / 6.0).exp2()).clamp(0.001, ANYTHING);
+    match (settings.format, settings.quality) {
+        _ if settings.clustering.is_some() => ANYTHING,
+        (Format::F32 | Format::F16, _) => 0.001,
+        (Format::Unorm8, _) => 0.006,
+        (Format::Bc4 | Format::Bc7, _) => 0.04,
+        (Format::Adaptive, Quality::Psnr(db)) => at_psnr(db),
+        // An error that every voxel may have is a PSNR that the whole has at least.
+        (Format::Adaptive, Quality::MaxError(bound)) => {
+            bound.fraction().map_or(ANYTHING, |fraction| at_psnr(-20.0 * fraction.log10()))
+        }
+        (Format::Adaptive, Quality::BitsPerVoxel(_) | Quality::Size(_)) => ANYTHING,
     }
 }
 
@@ -99,12 +112,12 @@ fn default_max_flip(format: Format) -> f64 {
 /// When a source or a chunk of the pack cannot be read, a picture not be written, or a device fails.
 /// Differences are no error: they are in the report.
 pub fn pictures(pack: &Pack, sources: &Sources, settings: &PictureSettings) -> Result<PicturesReport> {
-    let format = pack.provenance.settings.format;
+    let has_bc4 = pack.atlas(Codec::Bc4).is_some();
     let renderer = Renderer::new(pack, settings.device).map_err(|e| Error::Unsupported(e.to_string()))?;
     let mut report = PicturesReport {
         device: renderer.is_gpu().then(|| renderer.device_name().to_owned()),
         skipped: renderer.fallback.clone(),
-        max_flip: settings.max_flip.unwrap_or(default_max_flip(format)),
+        max_flip: settings.max_flip.unwrap_or(default_max_flip(&pack.provenance.settings)),
         pictures: Vec::new(),
         failures: Vec::new(),
     };
@@ -116,7 +129,7 @@ pub fn pictures(pack: &Pack, sources: &Sources, settings: &PictureSettings) -> R
             let picture = compare(pack, sources, &renderer, [g, f], settings)?;
             let Some(picture) = picture else { continue };
             let what = format!("grid {:?} frame {}", grid.name, picture.frame);
-            let ties = if format == Format::Bc4 { BC4_TIE_PIXELS } else { TIE_PIXELS };
+            let ties = if has_bc4 { BC4_TIE_PIXELS } else { TIE_PIXELS };
             if let Some(t) = picture.tracers.filter(|t| t.pixels as f64 > ties * f64::from(SIDE * SIDE)) {
                 report.failures.push(format!(
                     "{what}: {} pixels differ between {} and the CPU tracer, by up to {:.2e}",
@@ -167,8 +180,8 @@ fn compare(
         trace::<f32>(&packed, &scene).ok_or_else(|| damaged(&"its transform cannot be inverted"))?;
     let tracers = if renderer.is_gpu() {
         let of_gpu = renderer.render(g, f, &scene).map_err(|e| Error::Other(e.to_string()))?;
-        let is_bc4 = pack.provenance.settings.format == Format::Bc4;
-        Some(tracer_difference(&of_gpu, &of_pack, if is_bc4 { BC4_TOLERANCE } else { TRACER_TOLERANCE }))
+        let has_bc4 = pack.atlas(Codec::Bc4).is_some();
+        Some(tracer_difference(&of_gpu, &of_pack, if has_bc4 { BC4_TOLERANCE } else { TRACER_TOLERANCE }))
     } else {
         None
     };

@@ -10,8 +10,10 @@ pub const BRICK_VOXELS: usize = 512;
 pub struct Brick {
     /// The 512 values, those of inactive voxels too.
     pub values: [f32; BRICK_VOXELS],
-    /// Which voxels are active; `None` where a voxel is active if its value is not the background.
-    pub mask: Option<Mask512>,
+    /// Which voxels of the source are active.
+    pub active: Mask512,
+    /// Whether that has to be kept. Else a pack's voxel is active where its value is not the background.
+    pub keeps_mask: bool,
 }
 
 /// What an inactive voxel under a mask reads as. The numbers are the pack's.
@@ -44,10 +46,9 @@ impl Brick {
     /// The simplest rule that gives every inactive voxel back bit by bit, and for
     /// [`InactiveRule::Sign`] the mask of those at minus the background.
     pub fn inactive_rule(&self, background: f32) -> (InactiveRule, Mask512) {
-        let Some(mask) = &self.mask else { return (InactiveRule::Texel, Mask512::NONE) };
         let mut minus = Mask512::NONE;
         let mut inactive = 0;
-        for i in (0..BRICK_VOXELS).filter(|&i| !mask.get(i)) {
+        for i in (0..BRICK_VOXELS).filter(|&i| !self.active.get(i)) {
             inactive += 1;
             let bits = self.values[i].to_bits();
             if bits == background.to_bits() {
@@ -66,7 +67,7 @@ impl Brick {
 
     /// Whether every voxel is active with the same bits, or inactive with the same bits.
     pub fn constant(&self) -> Option<super::Constant> {
-        let mask = self.mask?;
+        let mask = self.active;
         let first = self.values[0];
         let same = || self.values.iter().all(|v| v.to_bits() == first.to_bits());
         (mask == Mask512::ALL && same()).then_some(super::Constant { value: first, active: true }).or_else(

@@ -79,6 +79,8 @@ pub struct FrameStats {
     pub leaves: u64,
     /// Active voxels, tiles in full.
     pub active_voxels: u64,
+    /// Active voxels of leaves: what PSNR is measured over.
+    pub active_leaf_voxels: u64,
     /// The active voxels' box.
     pub bbox: CoordBox,
     /// The range of active values, tiles included.

@@ -26,6 +26,11 @@ impl Mask512 {
         Self(words)
     }
 
+    /// The voxels that are on in either.
+    pub fn union(&self, other: &Self) -> Self {
+        Self(std::array::from_fn(|i| self.0[i] | other.0[i]))
+    }
+
     /// How many voxels are on.
     pub fn count(&self) -> u32 {
         self.0.iter().map(|w| w.count_ones()).sum()

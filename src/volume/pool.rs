@@ -16,6 +16,8 @@ const SCRATCH_BRICK_BYTES: usize = BRICK_VOXELS * 4 + 64 + 1;
 /// Memory is about 50 bytes a unique brick; the 2 KB of voxels go to an unnamed temporary file.
 pub struct BrickPool {
     by_hash: HashMap<u128, u32>,
+    /// The active voxels of bricks of which the scratch file has only the first one's.
+    widened: HashMap<u32, Mask512>,
     writer: BufWriter<File>,
     reader: File,
     len: u32,
@@ -32,7 +34,7 @@ impl BrickPool {
         let file = tempfile::tempfile()?;
         let reader = file.try_clone()?;
         let writer = BufWriter::with_capacity(1 << 20, file);
-        Ok(Self { by_hash: HashMap::new(), writer, reader, len: 0, flushed: 0 })
+        Ok(Self { by_hash: HashMap::new(), widened: HashMap::new(), writer, reader, len: 0, flushed: 0 })
     }
 
     /// How many unique bricks there are.
@@ -49,8 +51,8 @@ impl BrickPool {
     pub fn hash(brick: &Brick) -> u128 {
         let mut hasher = Xxh3Default::new();
         hasher.update(bytemuck::bytes_of(&brick.values));
-        if let Some(mask) = &brick.mask {
-            hasher.update(bytemuck::bytes_of(mask));
+        if brick.keeps_mask {
+            hasher.update(bytemuck::bytes_of(&brick.active));
         }
         hasher.digest128()
     }
@@ -62,15 +64,21 @@ impl BrickPool {
     pub fn insert(&mut self, hash: u128, brick: &Brick) -> io::Result<(u32, bool)> {
         if let Some(&id) = self.by_hash.get(&hash) {
             // Equal hashes are compared: a collision costs a second copy, never a wrong voxel.
-            if self.get(id)?.same_bits(brick) {
+            let known = self.get(id)?;
+            if known.same_bits(brick) {
+                if known.active != brick.active {
+                    // Without a kept mask bricks are one if their values are. The pool's counts as
+                    // active what is active in any of them.
+                    self.widened.insert(id, known.active.union(&brick.active));
+                }
                 return Ok((id, false));
             }
         }
         let id = self.len;
         self.by_hash.entry(hash).or_insert(id);
         self.writer.write_all(bytemuck::bytes_of(&brick.values))?;
-        self.writer.write_all(bytemuck::bytes_of(&brick.mask.unwrap_or_default()))?;
-        self.writer.write_all(&[u8::from(brick.mask.is_some())])?;
+        self.writer.write_all(bytemuck::bytes_of(&brick.active))?;
+        self.writer.write_all(&[u8::from(brick.keeps_mask)])?;
         self.len += 1;
         Ok((id, true))
     }
@@ -79,6 +87,14 @@ impl BrickPool {
         let mut one = Vec::with_capacity(1);
         self.read(id..id + 1, &mut one)?;
         Ok(one.pop().expect("one brick was read"))
+    }
+
+    /// Appends the bricks of some numbers, ascending, to `out`.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be read back.
+    pub fn read_each(&mut self, ids: &[u32], out: &mut Vec<Brick>) -> io::Result<()> {
+        ids.chunk_by(|a, b| a + 1 == *b).try_for_each(|run| self.read(run[0]..run[0] + run.len() as u32, out))
     }
 
     /// Appends the bricks of a range of numbers to `out`.
@@ -95,11 +111,13 @@ impl BrickPool {
         self.reader.seek(SeekFrom::Start(u64::from(ids.start) * SCRATCH_BRICK_BYTES as u64))?;
         self.reader.read_exact(&mut bytes)?;
         self.reader.seek(SeekFrom::End(0))?;
-        out.extend(bytes.chunks_exact(SCRATCH_BRICK_BYTES).map(|b| {
+        out.extend(bytes.chunks_exact(SCRATCH_BRICK_BYTES).zip(ids).map(|(b, id)| {
             let (values, rest) = b.split_at(BRICK_VOXELS * 4);
+            let widened = self.widened.get(&id).copied();
             Brick {
                 values: bytemuck::pod_read_unaligned(values),
-                mask: (rest[64] != 0).then(|| bytemuck::pod_read_unaligned::<Mask512>(&rest[..64])),
+                active: widened.unwrap_or_else(|| bytemuck::pod_read_unaligned(&rest[..64])),
+                keeps_mask: rest[64] != 0,
             }
         }));
         Ok(())
@@ -108,7 +126,9 @@ impl BrickPool {
 
 impl Brick {
     fn same_bits(&self, other: &Self) -> bool {
-        self.mask == other.mask && bytemuck::bytes_of(&self.values) == bytemuck::bytes_of(&other.values)
+        bytemuck::bytes_of(&self.values) == bytemuck::bytes_of(&other.values)
+            && self.keeps_mask == other.keeps_mask
+            && (!self.keeps_mask || self.active == other.active)
     }
 }
 

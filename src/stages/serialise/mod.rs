@@ -7,9 +7,9 @@ use std::io;
 use std::path::Path;
 
 use super::allocate::Allocation;
-use super::dedup::{CellRef, FrameTree, Payload, SequenceTree};
+use super::dedup::SequenceTree;
 use super::quantise::{GridBricks, Outcome, QuantiseError, quantise};
-use super::relayout;
+use super::relayout::{self, Layout, PlannedAtlas};
 use crate::codec::Codec;
 use crate::pack::layout::{AtlasRecord, CHUNK_BYTES, FrameRecord, GridRecord, encoding, kind};
 use crate::pack::tree::L3Record;
@@ -63,13 +63,10 @@ pub enum SerialiseError {
     },
 }
 
-/// Writes the pack beside `path`, where its caller puts it once it is verified. All grids use the codec of the first.
+/// Writes the pack beside `path`, where its caller puts it once it is verified.
 ///
 /// # Errors
 /// [`SerialiseError`]. Nothing is left at `path` that was not there before.
-///
-/// # Panics
-/// When there is no grid.
 pub fn serialise(
     path: &Path,
     grids: &mut [GridInput],
@@ -77,35 +74,22 @@ pub fn serialise(
     zstd_level: Option<i32>,
     mut progress: impl FnMut(u64),
 ) -> Result<FinishedPack, SerialiseError> {
-    let codec = grids[0].allocation.codec;
-    let bricks: u64 = grids.iter().map(|g| u64::from(g.tree.pool.len())).sum();
-    if bricks >= L3Record::MAX_SLOTS.into() {
+    let layout = relayout::place(&grids.iter().map(|g| &g.allocation).collect::<Vec<_>>());
+    if layout.atlases.iter().any(|a| a.atlas.bricks >= L3Record::MAX_SLOTS) {
         return Err(too_large(
             &grids[0].name,
-            format!("{bricks} distinct bricks, a pack holds 2^27: use fewer frames"),
+            "more distinct bricks of one codec than the 2^27 that a pack holds: use fewer frames".to_owned(),
         ));
     }
-    let atlas = relayout::plan(codec, bricks as u32);
     let boxes = grids.iter().map(CellBox::around).collect::<Result<Vec<_>, _>>()?;
-    let first_slots: Vec<u32> =
-        grids.iter().scan(0, |next, g| Some(std::mem::replace(next, *next + g.tree.pool.len()))).collect();
-    let mut words = TreeWords::build(grids, &boxes, &atlas, &first_slots);
+    let mut words = TreeWords::build(grids, &boxes, &layout);
 
     let plain = if zstd_level.is_some() { encoding::ZSTD } else { encoding::RAW };
-    let texel_encoding = match (codec, zstd_level) {
-        (_, None) => encoding::RAW,
-        (Codec::F16, _) => encoding::ZSTD_SHUFFLE_2,
-        (Codec::F32, _) => encoding::ZSTD_SHUFFLE_4,
-        _ => encoding::ZSTD,
-    };
     let level = zstd_level.unwrap_or(0);
-
     let names: String = grids.iter().map(|g| g.name.as_str()).collect();
-    let slabs: Vec<Vec<Vec<u32>>> =
-        grids.iter().zip(&first_slots).map(|(g, &s)| frame_slabs(g, &atlas, s)).collect();
-    let list_len: usize = slabs.iter().flatten().map(Vec::len).sum();
     let frame_count: usize = grids.iter().map(|g| g.frames.len()).sum();
     let provenance = serde_json::to_vec_pretty(provenance).map_err(io::Error::from)?;
+    let atlases: Vec<AtlasRecord> = layout.atlases.iter().map(|a| atlas_record(&a.atlas)).collect();
 
     let spec = |kind, encoding, raw_bytes: usize| SectionSpec {
         kind,
@@ -114,61 +98,79 @@ pub fn serialise(
         chunk_bytes: CHUNK_BYTES,
         raw_bytes: raw_bytes as u64,
     };
-    let mut specs = vec![
-        spec(kind::GRIDS, encoding::RAW, grids.len() * size_of::<GridRecord>()),
-        spec(kind::NAMES, encoding::RAW, names.len()),
-        spec(kind::ATLASES, encoding::RAW, if atlas.bricks > 0 { size_of::<AtlasRecord>() } else { 0 }),
-        spec(kind::FRAME_CHUNKS, plain, list_len * 4),
-        spec(kind::PROVENANCE, plain, provenance.len()),
-    ];
-    let chunks_before: u64 = specs.iter().map(|s| s.raw_bytes.div_ceil(s.chunk_bytes.into())).sum();
-    if atlas.bricks > 0 {
-        specs.push(SectionSpec {
+    // Texels come first, so that which chunks a frame needs is known before the sections of unknown length
+    // are: those and the tables hold what encoding cost, and the tree the packing axes that it chose.
+    let mut specs: Vec<SectionSpec> = layout
+        .atlases
+        .iter()
+        .map(|PlannedAtlas { atlas, .. }| SectionSpec {
             kind: kind::TEXELS,
-            codec: codec as u32,
-            encoding: texel_encoding,
+            codec: atlas.codec as u32,
+            encoding: texel_encoding(atlas.codec, zstd_level.is_some()),
             chunk_bytes: atlas.slab_bytes() as u32,
             raw_bytes: atlas.bytes(),
-        });
-    }
-    // Frames and tree come last: they hold what encoding cost, and the packing axes that it chose.
-    specs.push(spec(kind::FRAMES, plain, frame_count * size_of::<FrameRecord>()));
-    specs.push(spec(kind::TREE, plain, words.words.len() * 4));
+        })
+        .collect();
+    let (mut frames, lists) = frame_tables(grids, &frame_slabs(grids, &layout));
+    specs.extend([
+        spec(kind::GRIDS, encoding::RAW, grids.len() * size_of::<GridRecord>()),
+        spec(kind::NAMES, encoding::RAW, names.len()),
+        spec(kind::ATLASES, encoding::RAW, size_of_val(&*atlases)),
+        spec(kind::FRAME_CHUNKS, plain, size_of_val(&*lists)),
+        spec(kind::PROVENANCE, plain, provenance.len()),
+        spec(kind::FRAMES, plain, frame_count * size_of::<FrameRecord>()),
+        spec(kind::TREE, plain, words.words.len() * 4),
+    ]);
 
-    let (mut frames, lists) = frame_tables(grids, &slabs, chunks_before as u32);
     let mut writer = PackWriter::create(path, specs)?;
-    writer.section(bytemuck::cast_slice(&grid_records(grids)), level)?;
-    writer.section(names.as_bytes(), level)?;
-    if atlas.bricks > 0 {
-        writer.section(bytemuck::bytes_of(&atlas_record(&atlas)), level)?;
-    } else {
-        writer.section(&[], level)?;
-    }
-    writer.section(bytemuck::cast_slice(&lists), level)?;
-    writer.section(&provenance, level)?;
-
-    if atlas.bricks > 0 {
+    let mut outcomes: Vec<Outcome> = grids.iter().map(|g| Outcome::before(&g.allocation)).collect();
+    let mut sources: Vec<GridBricks> = grids
+        .iter_mut()
+        .map(|g| GridBricks { tree: &mut g.tree, allocation: &mut g.allocation })
+        .collect();
+    for planned in &layout.atlases {
         writer.begin()?;
-        let mut sources: Vec<GridBricks> = grids
-            .iter_mut()
-            .zip(&first_slots)
-            .map(|(g, &first_slot)| GridBricks { tree: &mut g.tree, allocation: &g.allocation, first_slot })
-            .collect();
-        let outcomes = quantise(
-            &atlas,
+        let encoding = texel_encoding(planned.atlas.codec, zstd_level.is_some());
+        quantise(
+            planned,
             &mut sources,
-            |slab| compress_chunk(slab, texel_encoding, level),
+            &mut outcomes,
+            |slab| compress_chunk(slab, encoding, level),
             |chunk| {
-                progress(atlas.slab_bricks().into());
+                progress(planned.atlas.slab_bricks().into());
                 writer.chunk(&chunk)
             },
         )?;
-        words.set_axes(grids, &outcomes);
-        set_errors(&mut frames, grids, &outcomes);
     }
+    words.set_axes(grids, &outcomes);
+    set_errors(&mut frames, grids, &outcomes);
+    writer.section(bytemuck::cast_slice(&grid_records(grids, &outcomes)), level)?;
+    writer.section(names.as_bytes(), level)?;
+    writer.section(bytemuck::cast_slice(&atlases), level)?;
+    writer.section(bytemuck::cast_slice(&lists), level)?;
+    writer.section(&provenance, level)?;
     writer.section(bytemuck::cast_slice(&frames), level)?;
     writer.section(bytemuck::cast_slice(&words.words), level)?;
     Ok(writer.finish()?)
+}
+
+/// Bytes of the tree and its masks, which do not depend on how bricks are coded.
+///
+/// # Errors
+/// [`SerialiseError::TooLarge`].
+pub fn tree_bytes(grids: &[GridInput]) -> Result<u64, SerialiseError> {
+    let boxes = grids.iter().map(CellBox::around).collect::<Result<Vec<_>, _>>()?;
+    let nothing = Layout { atlases: Vec::new(), slots: Vec::new() };
+    Ok(TreeWords::build(grids, &boxes, &nothing).words.len() as u64 * 4)
+}
+
+fn texel_encoding(codec: Codec, zstd: bool) -> u32 {
+    match codec {
+        _ if !zstd => encoding::RAW,
+        Codec::F16 => encoding::ZSTD_SHUFFLE_2,
+        Codec::F32 => encoding::ZSTD_SHUFFLE_4,
+        _ => encoding::ZSTD,
+    }
 }
 
 fn too_large(grid: &str, what: String) -> SerialiseError {
@@ -180,11 +182,12 @@ fn atlas_record(atlas: &Atlas) -> AtlasRecord {
     AtlasRecord { codec: codec as u32, bricks, columns, rows, slabs, page_slabs }
 }
 
-fn grid_records(grids: &[GridInput]) -> Vec<GridRecord> {
+fn grid_records(grids: &[GridInput], outcomes: &[Outcome]) -> Vec<GridRecord> {
     let (mut name_offset, mut first_frame) = (0, 0);
     grids
         .iter()
-        .map(|g| {
+        .zip(outcomes)
+        .map(|(g, outcome)| {
             let active = g.tree.active_range();
             let record = GridRecord {
                 name_offset,
@@ -195,6 +198,7 @@ fn grid_records(grids: &[GridInput]) -> Vec<GridRecord> {
                 fps: g.fps,
                 active_min: active.map_or(0.0, |r| r.min),
                 active_max: active.map_or(0.0, |r| r.max),
+                codec_norms: codec_norms(g, outcome),
             };
             name_offset += record.name_bytes;
             first_frame += record.frames;
@@ -203,32 +207,50 @@ fn grid_records(grids: &[GridInput]) -> Vec<GridRecord> {
         .collect()
 }
 
-/// The bricks of the pool that a frame uses, shared ones each time.
-fn frame_bricks<'a>(tree: &'a SequenceTree, frame: &'a FrameTree) -> impl Iterator<Item = u32> + 'a {
-    let nodes = frame.cells.iter().filter_map(|(_, content)| match content {
-        CellRef::Node(node) => Some(&tree.nodes.items()[*node as usize]),
-        CellRef::Constant(_) => None,
-    });
-    let records = nodes.flat_map(|node| node.entries(&tree.runs)).map(|&r| &tree.records[r as usize]);
-    records.filter_map(|record| match record.payload {
-        Payload::Brick(id) => Some(id),
-        Payload::Constant(_) => None,
-    })
+/// For each grid and frame the chunks that its bricks lie in, ascending: the texel sections are the first of the
+/// file, and a slab is a chunk.
+fn frame_slabs(grids: &[GridInput], layout: &Layout) -> Vec<Vec<Vec<u32>>> {
+    let mut first_chunk = [0; Codec::WITH_TEXELS.len() + 1];
+    let mut slab_bricks = [1; Codec::WITH_TEXELS.len() + 1];
+    let mut chunks = 0;
+    for PlannedAtlas { atlas, .. } in &layout.atlases {
+        first_chunk[atlas.codec as usize] = chunks;
+        slab_bricks[atlas.codec as usize] = atlas.slab_bricks();
+        chunks += atlas.slabs;
+    }
+    let of_grid = |(grid, slots): (&GridInput, &Vec<u32>)| {
+        let chunk = |id: u32| {
+            let codec = grid.allocation.codec(id);
+            let tag = codec as usize;
+            (codec != Codec::Constant).then(|| first_chunk[tag] + slots[id as usize] / slab_bricks[tag])
+        };
+        let of_frame = |frame| grid.tree.frame_bricks(frame).filter_map(chunk).collect::<BTreeSet<u32>>();
+        grid.tree.frames.iter().map(|frame| of_frame(frame).into_iter().collect()).collect()
+    };
+    grids.iter().zip(&layout.slots).map(of_grid).collect()
 }
 
-/// The slabs that each frame's bricks lie in, ascending.
-fn frame_slabs(grid: &GridInput, atlas: &Atlas, first_slot: u32) -> Vec<Vec<u32>> {
-    let slabs = |frame| frame_bricks(&grid.tree, frame).map(|id| (first_slot + id) / atlas.slab_bricks());
-    let sorted = |frame| slabs(frame).collect::<BTreeSet<u32>>().into_iter().collect();
-    grid.tree.frames.iter().map(sorted).collect()
+/// What each codec cost a grid: the root of the squared error of its bricks over all frames, by tag.
+fn codec_norms(grid: &GridInput, outcome: &Outcome) -> [f32; Codec::WITH_TEXELS.len() + 1] {
+    let mut squares = [0.0; Codec::WITH_TEXELS.len() + 1];
+    for frame in &grid.tree.frames {
+        for id in grid.tree.frame_bricks(frame) {
+            squares[grid.allocation.codec(id) as usize] += f64::from(outcome.norms[id as usize]).powi(2);
+        }
+    }
+    squares[Codec::Constant as usize] += grid.allocation.empty_squares.iter().sum::<f64>();
+    squares.map(|s: f64| (s.sqrt() as f32).min(f32::MAX))
 }
 
 /// Fills in what encoding cost each frame.
 fn set_errors(frames: &mut [FrameRecord], grids: &[GridInput], outcomes: &[Outcome]) {
     let mut frames = frames.iter_mut();
     for (grid, outcome) in grids.iter().zip(outcomes) {
+        let mut empty = grid.allocation.empty_squares.iter();
         for (tree, frame) in grid.tree.frames.iter().zip(&mut frames) {
-            let squares: f64 = frame_bricks(&grid.tree, tree).map(|id| outcome.squares[id as usize]).sum();
+            let square = |id: u32| f64::from(outcome.norms[id as usize]).powi(2);
+            let squares: f64 = grid.tree.frame_bricks(tree).map(square).sum();
+            let squares = squares + empty.next().copied().unwrap_or(0.0);
             frame.error_norm = (squares.sqrt() as f32).min(f32::MAX);
         }
     }
@@ -237,7 +259,6 @@ fn set_errors(frames: &mut [FrameRecord], grids: &[GridInput], outcomes: &[Outco
 fn frame_tables(
     grids: &[GridInput],
     slabs: &[Vec<Vec<u32>>],
-    first_chunk: u32,
 ) -> (Vec<FrameRecord>, Vec<u32>) {
     let mut records = Vec::new();
     let mut lists: Vec<u32> = Vec::new();
@@ -255,7 +276,7 @@ fn frame_tables(
                 active_voxels: frame.stats.active_voxels,
                 transform: input.transform,
             });
-            lists.extend(slabs.iter().map(|slab| first_chunk + slab));
+            lists.extend(slabs);
         }
     }
     (records, lists)

@@ -4,12 +4,13 @@ use std::collections::BTreeMap;
 
 use super::{GridInput, SerialiseError, too_large};
 use crate::codec::Codec;
-use crate::pack::Atlas;
 use crate::pack::tree::{
     self, GRID_WORDS, HEADER_WORDS, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS,
 };
+use crate::stages::allocate::Coding;
 use crate::stages::dedup::{CellRef, FrameTree, Payload, SequenceTree};
 use crate::stages::quantise::Outcome;
+use crate::stages::relayout::{Layout, PlannedAtlas};
 use crate::volume::{CELL_DIM, Constant, Coord, Interner, ROOT_DIM};
 
 /// L1 nodes that all frames of a grid may have room for: 64 MB of links. A box of 40 of them an axis is
@@ -96,7 +97,8 @@ pub(super) struct TreeWords {
 }
 
 impl TreeWords {
-    pub fn build(grids: &[GridInput], boxes: &[CellBox], atlas: &Atlas, first_slots: &[u32]) -> Self {
+    /// Builds them; without slots in `layout`, records stay zero.
+    pub fn build(grids: &[GridInput], boxes: &[CellBox], layout: &Layout) -> Self {
         let mut constants = Interner::<u32>::default();
         let grids_at = HEADER_WORDS;
         let roots_at = grids_at + grids.len() * GRID_WORDS;
@@ -141,7 +143,7 @@ impl TreeWords {
             ] {
                 words[place] = value as u32;
             }
-            if atlas.bricks > 0 {
+            for PlannedAtlas { atlas, .. } in &layout.atlases {
                 let at = h::atlas(atlas.codec);
                 words[at..at + 3].copy_from_slice(&[atlas.columns, atlas.rows, atlas.page_slabs]);
             }
@@ -162,12 +164,13 @@ impl TreeWords {
             first_record += run_len(&grid.tree) as u32;
         }
         let mut first_mask = 0;
-        for (grid, &first_slot) in grids.iter().zip(first_slots) {
+        for (grid, slots) in grids.iter().zip(&layout.slots) {
             for &record in grid.tree.runs.items() {
-                words.extend(l3_record(grid, record, first_slot, first_mask).to_words());
+                words.extend(l3_record(grid, record, slots, first_mask).to_words());
             }
             first_mask += grid.tree.masks.items().len() as u32;
         }
+        words.resize(mask_at, 0);
         for grid in grids {
             words.extend(grid.tree.masks.items().iter().flat_map(|m| m.to_words()));
         }
@@ -181,7 +184,9 @@ impl TreeWords {
         let mut at = self.record_at;
         for (grid, outcome) in grids.iter().zip(outcomes) {
             for &record in grid.tree.runs.items() {
-                if let Payload::Brick(id) = grid.tree.records[record as usize].payload {
+                if let Payload::Brick(id) = grid.tree.records[record as usize].payload
+                    && grid.allocation.codec(id) != Codec::Constant
+                {
                     self.words[at] |= u32::from(outcome.axes[id as usize]) << 3;
                 }
                 at += RECORD_WORDS;
@@ -247,12 +252,17 @@ fn frame_roots(
     roots
 }
 
-fn l3_record(grid: &GridInput, record: u32, first_slot: u32, first_mask: u32) -> L3Record {
+fn l3_record(grid: &GridInput, record: u32, slots: &[u32], first_mask: u32) -> L3Record {
     let record = &grid.tree.records[record as usize];
     let (codec, slot, word2) = match record.payload {
         Payload::Constant(value) => (Codec::Constant, 0, value.to_bits()),
         Payload::Brick(id) => {
-            (grid.allocation.codec, first_slot + id, grid.allocation.ranges[id as usize].to_word())
+            let word2 = match grid.allocation.codings[id as usize] {
+                Coding::Empty => grid.tree.background.to_bits(),
+                Coding::Constant(value) => value.to_bits(),
+                _ => grid.allocation.ranges[id as usize].to_word(),
+            };
+            (grid.allocation.codec(id), slots[id as usize], word2)
         }
     };
     L3Record { codec, axis: 0, slot, mask: record.mask.map(|m| first_mask + m), rule: record.rule, word2 }

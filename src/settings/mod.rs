@@ -1,7 +1,13 @@
 //! What a build can be asked for: the words of the manifest, the command line and a pack's provenance.
 
+mod clustering;
+mod quality;
+
 use clap::ValueEnum;
 use serde::{Deserialize, Serialize};
+
+pub use clustering::{ClusterArgs, Clustering, Dedup};
+pub use quality::{ByteSize, DEFAULT_PSNR, ErrorBound, FRAME_MARGIN_DB, Quality, QualityArgs};
 
 use crate::codec::Codec;
 
@@ -9,12 +15,14 @@ use crate::codec::Codec;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Format {
+    /// Each brick in the cheapest codec for the quality asked
+    #[default]
+    Adaptive,
     /// 32-bit floats, lossless
     F32,
     /// 16-bit floats, exact where the source is half
     F16,
     /// 8 bits a voxel
-    #[default]
     Unorm8,
     /// BC4 blocks, 4 bits a voxel
     Bc4,
@@ -23,19 +31,25 @@ pub enum Format {
 }
 
 impl Format {
-    /// The codec of every brick that is not constant.
-    pub fn codec(self) -> Codec {
+    /// The codec of every brick that is not constant, where there is one for all.
+    pub fn codec(self) -> Option<Codec> {
         match self {
-            Self::F32 => Codec::F32,
-            Self::F16 => Codec::F16,
-            Self::Unorm8 => Codec::Unorm8,
-            Self::Bc4 => Codec::Bc4,
-            Self::Bc7 => Codec::Bc7,
+            Self::Adaptive => None,
+            Self::F32 => Some(Codec::F32),
+            Self::F16 => Some(Codec::F16),
+            Self::Unorm8 => Some(Codec::Unorm8),
+            Self::Bc4 => Some(Codec::Bc4),
+            Self::Bc7 => Some(Codec::Bc7),
         }
     }
 
-    /// Every format, finest first.
-    pub const ALL: [Self; 5] = [Self::F32, Self::F16, Self::Unorm8, Self::Bc4, Self::Bc7];
+    /// Its name in manifests and reports.
+    pub fn name(self) -> &'static str {
+        self.codec().map_or("adaptive", Codec::name)
+    }
+
+    /// The formats of one codec, finest first.
+    pub const UNIFORM: [Self; 5] = [Self::F32, Self::F16, Self::Unorm8, Self::Bc4, Self::Bc7];
 }
 
 /// What the 0 and 1 of normalised texels stand for.
@@ -84,6 +98,12 @@ pub struct Settings {
     pub grids: Vec<String>,
     /// How bricks are stored.
     pub format: Format,
+    /// What an adaptive pack meets.
+    pub quality: Quality,
+    /// The PSNR that no frame of an adaptive pack falls below, in dB; none for 6 dB below the whole.
+    pub min_frame_psnr: Option<f64>,
+    /// How similar bricks are clustered; none for not at all.
+    pub clustering: Option<Clustering>,
     /// What normalised texels are fractions of.
     pub range: RangeMode,
     /// Whether bricks keep their masks.
@@ -101,6 +121,9 @@ impl Default for Settings {
         Self {
             grids: Vec::new(),
             format: Format::default(),
+            quality: Quality::default(),
+            min_frame_psnr: None,
+            clustering: None,
             range: RangeMode::default(),
             masks: Masks::default(),
             nonfinite: NonFinite::default(),

@@ -1,0 +1,86 @@
+//! Similar bricks made one, as manifests and the command line ask for it.
+
+use clap::{Args, ValueEnum};
+use serde::{Deserialize, Serialize};
+
+/// Which bricks are one.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Dedup {
+    /// Those with the same bits
+    #[default]
+    Exact,
+    /// Those that k-means puts into one cluster, as in the Utrecht thesis
+    Kmeans,
+}
+
+/// How `dedup = "kmeans"` clusters (Utrecht thesis, 4.5 and 5.3).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Clustering {
+    /// How many clusters there are at most: the thesis's k.
+    pub clusters: u32,
+    /// How often centroids are moved to the middle of their members.
+    pub iterations: u32,
+    /// Bricks of more variance than this, once each is stretched to 0..1, stay as they are.
+    pub variance: f64,
+    /// What the first centroids are drawn by.
+    pub seed: u64,
+}
+
+impl Default for Clustering {
+    /// The settings at which the thesis's cloud is no longer blocky (its figure 19, d).
+    fn default() -> Self {
+        Self { clusters: 100, iterations: 5, variance: 0.01, seed: 0 }
+    }
+}
+
+/// The settings that make a [`Clustering`].
+#[derive(Args, Clone, Debug, Default, PartialEq)]
+pub struct ClusterArgs {
+    /// Which bricks are one [default: exact]
+    #[arg(long)]
+    pub dedup: Option<Dedup>,
+    /// With --dedup kmeans: the clusters, the thesis's k [default: 100]
+    #[arg(long, value_name = "K")]
+    pub clusters: Option<u32>,
+    /// With --dedup kmeans: the iterations [default: 5]
+    #[arg(long, value_name = "N")]
+    pub iterations: Option<u32>,
+    /// With --dedup kmeans: bricks of more variance stay as they are [default: 0.01]
+    #[arg(long, value_name = "VARIANCE")]
+    pub variance: Option<f64>,
+    /// With --dedup kmeans: the seed of the first centroids [default: 0]
+    #[arg(long)]
+    pub seed: Option<u64>,
+}
+
+impl ClusterArgs {
+    /// How similar bricks are clustered; `None` for not at all.
+    ///
+    /// # Errors
+    /// When a number makes no sense, or k-means is given settings without being asked for.
+    pub fn clustering(&self) -> Result<Option<Clustering>, String> {
+        let default = Clustering::default();
+        let clustering = Clustering {
+            clusters: self.clusters.unwrap_or(default.clusters),
+            iterations: self.iterations.unwrap_or(default.iterations),
+            variance: self.variance.unwrap_or(default.variance),
+            seed: self.seed.unwrap_or(default.seed),
+        };
+        if self.dedup != Some(Dedup::Kmeans) {
+            return match clustering == default {
+                true => Ok(None),
+                false => {
+                    Err("clusters, iterations, variance and seed are for dedup = \"kmeans\"".to_owned())
+                }
+            };
+        }
+        if clustering.clusters == 0 {
+            return Err("clusters is a number above 0".to_owned());
+        }
+        if !(clustering.variance >= 0.0 && clustering.variance.is_finite()) {
+            return Err("variance is a number not below 0".to_owned());
+        }
+        Ok(Some(clustering))
+    }
+}

@@ -1,0 +1,143 @@
+//! Stage 5: how each brick is coded, and what its texels' 0 and 1 stand for.
+//!
+//! A uniform format gives every brick one codec. The adaptive one tries codecs on bricks (`trial`) and gives
+//! each the one that serves the whole best (`search`), as rate-distortion theory has it: the least
+//! D + λR, with one λ for all (Shoham & Gersho 1988).
+
+mod search;
+mod share;
+mod trial;
+
+use std::io;
+
+use half::f16;
+
+use super::dedup::SequenceTree;
+use crate::codec::{BrickRange, Codec, SequenceRange};
+use crate::settings::RangeMode;
+
+pub use search::{AdaptiveGrid, Target, adaptive};
+pub use trial::KeptTexels;
+
+/// How one grid's bricks are coded.
+#[derive(Default)]
+pub struct Allocation {
+    /// The range that brick ranges are fractions of.
+    pub sequence: SequenceRange,
+    /// How each brick of the pool is coded.
+    pub codings: Vec<Coding>,
+    /// The range of each brick of the pool.
+    pub ranges: Vec<BrickRange>,
+    /// Texels that several bricks share.
+    pub shapes: Vec<Shape>,
+    /// The root of the squared error of each brick over the voxels that its texels give, as far as it is
+    /// known before texels are made: 0 where [`super::quantise`] will measure it.
+    pub norms: Vec<f32>,
+    /// The squared error of each frame's empty bricks.
+    pub empty_squares: Vec<f64>,
+    /// Texels that were made to be tried.
+    pub kept: Option<KeptTexels>,
+}
+
+/// What gives a brick its values.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Coding {
+    /// The background: it needs no record.
+    Empty,
+    /// One value for all voxels that no rule gives.
+    Constant(f32),
+    /// Texels of its own.
+    Own(Codec),
+    /// The texels of this place of [`Allocation::shapes`].
+    Shared(u32),
+}
+
+/// Texels that several bricks share, each with its own range.
+pub struct Shape {
+    /// Their codec.
+    pub codec: Codec,
+    /// One brick's bytes.
+    pub bytes: Vec<u8>,
+    /// Their packing axis.
+    pub axis: u8,
+}
+
+/// The pack cannot be allocated.
+#[derive(Debug, thiserror::Error)]
+pub enum AllocateError {
+    /// Reading bricks back failed.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+    /// A grid's values span more than an `f32` can hold.
+    #[error("the values of grid {grid} span more than an f32 can hold")]
+    TooWide {
+        /// Which of the grids.
+        grid: usize,
+    },
+    /// Not even the cheapest codecs are small enough.
+    #[error(
+        "{asked} bytes on the GPU cannot be reached: the least is {least}, of which {fixed} are tree and masks: \
+         raise size or bits_per_voxel, or pack fewer frames"
+    )]
+    TooSmall {
+        /// What was asked for.
+        asked: u64,
+        /// The least that there is.
+        least: u64,
+        /// The part of it that no codec changes.
+        fixed: u64,
+    },
+}
+
+impl Allocation {
+    /// The ranges of a grid's bricks; nothing is allocated yet. `None` when the sequence's values span more than an
+    /// `f32` can hold.
+    fn ranges(tree: &SequenceTree, mode: RangeMode) -> Option<(SequenceRange, Vec<BrickRange>)> {
+        let sequence = match tree.value_range() {
+            Some(range) => SequenceRange::around(range.min, range.max)?,
+            None => SequenceRange::default(),
+        };
+        let ranges = match mode {
+            RangeMode::Sequence => vec![BrickRange::SEQUENCE; tree.brick_ranges.len()],
+            RangeMode::Brick => tree.brick_ranges.iter().map(|r| sequence.fit(r.min, r.max)).collect(),
+        };
+        Some((sequence, ranges))
+    }
+
+    fn new(sequence: SequenceRange, ranges: Vec<BrickRange>, coding: Coding) -> Self {
+        let (codings, norms) = (vec![coding; ranges.len()], vec![0.0; ranges.len()]);
+        Self { sequence, codings, ranges, shapes: Vec::new(), norms, empty_squares: Vec::new(), kept: None }
+    }
+
+    /// The codec of a brick.
+    pub fn codec(&self, brick: u32) -> Codec {
+        match self.codings[brick as usize] {
+            Coding::Empty | Coding::Constant(_) => Codec::Constant,
+            Coding::Own(codec) => codec,
+            Coding::Shared(shape) => self.shapes[shape as usize].codec,
+        }
+    }
+
+    /// Raw texels need no range to be decoded: theirs is the tight one, for the majorant in it.
+    fn tighten(&mut self, tree: &SequenceTree) {
+        for ((range, coding), values) in self.ranges.iter_mut().zip(&self.codings).zip(&tree.brick_ranges) {
+            *range = match coding {
+                Coding::Own(Codec::F32) => self.sequence.fit(values.min, values.max),
+                // What bounds a voxel is what its texel decodes to.
+                Coding::Own(Codec::F16) => {
+                    let [min, max] = [values.min, values.max].map(|v| f16::from_f32(v).to_f32());
+                    self.sequence.fit(min, max)
+                }
+                _ => *range,
+            };
+        }
+    }
+}
+
+/// Gives every brick of `tree` one codec. `None` when the sequence's values span more than an `f32` can hold.
+pub fn uniform(tree: &SequenceTree, codec: Codec, mode: RangeMode) -> Option<Allocation> {
+    let (sequence, ranges) = Allocation::ranges(tree, mode)?;
+    let mut allocation = Allocation::new(sequence, ranges, Coding::Own(codec));
+    allocation.tighten(tree);
+    Some(allocation)
+}
