@@ -289,16 +289,17 @@ fn grid_input(
 
 /// Decides how the bricks of every grid are coded.
 fn allocate_all(grids: &mut [GridInput], settings: &Settings, progress: &mut dyn Progress) -> Result<()> {
-    let scratch = |e| Error::io(std::env::temp_dir())(e);
-    let too_wide = |name: &str| {
-        Error::Input(format!(
-            "grid {name:?}: its values span more than an f32 can hold: scale the grid down before the export",
-        ))
-    };
     if let Some(codec) = settings.format.codec() {
-        for grid in grids {
-            let allocation = allocate::uniform(&grid.tree, codec, settings.range);
-            grid.allocation = allocation.ok_or_else(|| too_wide(&grid.name))?;
+        for g in 0..grids.len() {
+            let tree = &mut grids[g].tree;
+            let allocation = match &settings.clustering {
+                None => allocate::uniform(tree, codec, settings.range).ok_or(AllocateError::TooWide { grid: g }),
+                Some(clustering) => {
+                    progress.stage("cluster", tree.pool.len().into(), "bricks");
+                    allocate::clustered(tree, codec, settings.range, clustering).map_err(|e| e.in_grid(g))
+                }
+            };
+            grids[g].allocation = allocation.map_err(|e| allocate_error(e, grids))?;
         }
         return Ok(());
     }
@@ -319,13 +320,21 @@ fn allocate_all(grids: &mut [GridInput], settings: &Settings, progress: &mut dyn
     progress.stage("allocate", bricks, "bricks");
     let mut candidates: Vec<AdaptiveGrid> = grids.iter_mut().map(adaptive_grid).collect();
     let allocations = allocate::adaptive(&mut candidates, &target, &mut |bricks| progress.advance(bricks));
-    let allocations = allocations.map_err(|e| match e {
-            AllocateError::Io(source) => scratch(source),
-            AllocateError::TooWide { grid } => too_wide(&grids[grid].name),
-            AllocateError::TooSmall { .. } => Error::Usage(e.to_string()),
-        })?;
+    let allocations = allocations.map_err(|e| allocate_error(e, grids))?;
     grids.iter_mut().zip(allocations).for_each(|(grid, allocation)| grid.allocation = allocation);
     Ok(())
+}
+
+fn allocate_error(error: AllocateError, grids: &[GridInput]) -> Error {
+    match error {
+        AllocateError::Io(source) => Error::io(std::env::temp_dir())(source),
+        AllocateError::TooWide { grid } => Error::Input(format!(
+            "grid {:?}: its values span more than an f32 can hold: scale the grid down before the export",
+            grids[grid].name
+        )),
+        AllocateError::OutOfRange { grid, source } => Error::OutOfRange { grid: grids[grid].name.clone(), source },
+        AllocateError::TooSmall { .. } => Error::Usage(error.to_string()),
+    }
 }
 
 fn adaptive_grid(grid: &mut GridInput) -> AdaptiveGrid<'_> {

@@ -77,7 +77,7 @@ class Pack:
         self.tree, self.reals = (struct.unpack(f"<{len(tree) // 4}{form}", tree) for form in "If")
         self.atlases = {tag: (*size, own[7, tag].start) for tag, *size in struct.iter_unpack("<I4x2I8x", atlases)}
         numbers, self.grids = tuple(number for number, in struct.iter_unpack("<4xi184x", frames)), []
-        for at, length, first, count in struct.iter_unpack("<II4xII12x", grids):
+        for at, length, first, count in struct.iter_unpack("<II4xII36x", grids):
             head = struct.unpack_from("<3i6I3fI", tree, 4 * self.tree[2] + 64 * len(self.grids))
             self.grids.append(Grid(names[at:at + length].decode(), numbers[first:first + count],
                                    head[:3], head[3:6], head[6:9], *head[9:]))

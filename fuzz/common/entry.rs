@@ -37,7 +37,7 @@ fn read_grid(file: &VdbFile, grid: &GridInfo) -> bool {
     if let Err(error) = topology {
         return refused(&error);
     }
-    grid.transform.voxel_size();
+    grid.transform.matrix.as_ref().map(volpack::vdb::voxel_size);
     if !grid.value_type.is_scalar() {
         return true;
     }

@@ -97,7 +97,7 @@ pub fn build_packs(fixtures: &Path, out: &Path) -> Result<()> {
             for zstd in [0, 3] {
                 let job = Job {
                     frames: files.iter().map(|file| fixtures.join(format!("{file}.vdb"))).collect(),
-                    output: out.join(format!("{name}_{}_{zstd}.volpack", format.codec().name())),
+                    output: out.join(format!("{name}_{}_{zstd}.volpack", format.name())),
                     settings: Settings { grids: grids.clone(), format, zstd, ..Settings::default() },
                     strict: false,
                     verify: VerifyLevel::None,

@@ -48,8 +48,9 @@ impl Format {
         self.codec().map_or("adaptive", Codec::name)
     }
 
-    /// The formats of one codec, finest first.
-    pub const UNIFORM: [Self; 5] = [Self::F32, Self::F16, Self::Unorm8, Self::Bc4, Self::Bc7];
+    /// Every format: those of one codec, finest first, then the adaptive one.
+    pub const ALL: [Self; 6] =
+        [Self::F32, Self::F16, Self::Unorm8, Self::Bc4, Self::Bc7, Self::Adaptive];
 }
 
 /// What the 0 and 1 of normalised texels stand for.

@@ -4,6 +4,7 @@ use std::error::Error;
 use std::path::PathBuf;
 use std::time::Instant;
 
+use volpack::codec::Codec;
 use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::report::PackSummary;
@@ -30,8 +31,9 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     for sequence in &args.sequences {
         let (name, frames) = sequence::named(sequence)?;
         for format in Format::ALL {
+            let normalised = format.codec().is_some_and(Codec::is_normalised);
             for range in [RangeMode::Brick, RangeMode::Sequence] {
-                if range == RangeMode::Sequence && !format.codec().is_normalised() {
+                if range == RangeMode::Sequence && !normalised {
                     continue;
                 }
                 let settings = Settings { format, range, ..Settings::default() };
@@ -53,8 +55,8 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 let (range_name, grid) = (format!("{range:?}").to_lowercase(), &report.grids[0]);
                 println!(
                     "| {name} | {} | {} | {:.0} | {:.2} | {} | {:.4} | {seconds:.3} |",
-                    format.codec().name(),
-                    if format.codec().is_normalised() { range_name.as_str() } else { "" },
+                    format.name(),
+                    if normalised { range_name.as_str() } else { "" },
                     pack.gpu_bytes as f64 / 1024.0,
                     pack.bits_per_voxel,
                     grid.active.psnr.map_or("exact".to_owned(), |db| format!("{db:.2}")),

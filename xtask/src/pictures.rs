@@ -46,7 +46,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             let psnr = worst.psnr.map_or("same".to_owned(), |db| format!("{db:.1} dB"));
             println!(
                 "| {name} | {} | {:.4} | {psnr} | {:.5} |",
-                format.codec().name(),
+                format.name(),
                 worst.flip,
                 worst.rmse
             );

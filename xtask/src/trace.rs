@@ -69,7 +69,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             let shows = if grid.record.class == 1 { "depth" } else { "density" };
             println!(
                 "| {name} | {shows} | {} | {hdda:.3} | {dda:.3} | {:.2} | {hdda_steps:.1} | {dda_steps:.1} |",
-                format.codec().name(),
+                format.name(),
                 dda / hdda
             );
         }

@@ -4,6 +4,8 @@
 //! each the one that serves the whole best (`search`), as rate-distortion theory has it: the least
 //! D + λR, with one λ for all (Shoham & Gersho 1988).
 
+mod cluster;
+pub mod kmeans;
 mod search;
 mod share;
 mod trial;
@@ -13,9 +15,10 @@ use std::io;
 use half::f16;
 
 use super::dedup::SequenceTree;
-use crate::codec::{BrickRange, Codec, SequenceRange};
+use crate::codec::{BrickRange, Codec, OutOfRange, SequenceRange};
 use crate::settings::RangeMode;
 
+pub use cluster::clustered;
 pub use search::{AdaptiveGrid, Target, adaptive};
 pub use trial::KeptTexels;
 
@@ -74,6 +77,14 @@ pub enum AllocateError {
         /// Which of the grids.
         grid: usize,
     },
+    /// A value does not fit the codec, in the grid at this place.
+    #[error("{source}")]
+    OutOfRange {
+        /// Which of the grids.
+        grid: usize,
+        /// The value.
+        source: OutOfRange,
+    },
     /// Not even the cheapest codecs are small enough.
     #[error(
         "{asked} bytes on the GPU cannot be reached: the least is {least}, of which {fixed} are tree and masks: \
@@ -87,6 +98,17 @@ pub enum AllocateError {
         /// The part of it that no codec changes.
         fixed: u64,
     },
+}
+
+impl AllocateError {
+    /// The same of another grid.
+    pub fn in_grid(self, grid: usize) -> Self {
+        match self {
+            Self::TooWide { .. } => Self::TooWide { grid },
+            Self::OutOfRange { source, .. } => Self::OutOfRange { grid, source },
+            other => other,
+        }
+    }
 }
 
 impl Allocation {

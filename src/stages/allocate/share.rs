@@ -11,10 +11,10 @@ use half::f16;
 use ndarray::Array2;
 use rayon::prelude::*;
 
-use super::trial::{Cost, Rung, Trials};
-use crate::codec::{BrickRange, SequenceRange};
+use super::trial::{Cost, KeptOrBrick, Rung, Trials};
+use crate::codec::{BrickRange, SequenceRange, decode};
 use crate::stages::dedup::SequenceTree;
-use crate::volume::{BRICK_VOXELS, Brick, InactiveRule};
+use crate::volume::{BRICK_VOXELS, Brick, InactiveRule, Mask512};
 
 /// Borrowers that are compared at a time, and on both sides of them in the pool, which is in order of frames, the
 /// lenders that they are compared with: enough for the frame before and the one after, and linear in the sequence.
@@ -44,8 +44,8 @@ struct Lender {
     mean: f64,
     /// Sum of squared differences from the mean.
     energy: f64,
-    /// Its own squared error, of its extent.
-    error: f64,
+    /// The root of the part of its energy that is not its own error, which is stretched with it.
+    trust: f64,
 }
 
 /// For each of `borrowers`, ascending, the nearest of `lenders`, ascending, each with its rung: the closest first.
@@ -70,19 +70,28 @@ pub(super) fn loans(
 
 impl Trials {
     fn lenders(&mut self, tree: &mut SequenceTree, ids: &[(u32, Rung)]) -> io::Result<Vec<Lender>> {
-        let mut out = Vec::with_capacity(ids.len());
-        for &(id, rung) in ids {
-            let codec = rung.codec();
-            let (bytes, axis) = self.texels_of(tree, id, codec)?;
-            let texels = crate::codec::decode(codec, &bytes, axis, &SequenceRange::default(), BrickRange::SEQUENCE);
-            let mean = texels.iter().map(|t| f64::from(*t)).sum::<f64>() / BRICK_VOXELS as f64;
-            let energy = texels.iter().map(|t| (f64::from(*t) - mean).powi(2)).sum();
-            let extent = self.ranges[id as usize].extent.to_f64() * f64::from(self.sequence.span);
-            let norm = self.cost(id as usize, rung).map_or(0.0, |cost| f64::from(cost.norm));
-            out.push(Lender { id, texels, mean, energy, error: (norm / extent).powi(2) });
-        }
-        Ok(out)
+        let kept = ids
+            .iter()
+            .map(|&(id, rung)| self.kept_or_brick(tree, id, rung.codec()))
+            .collect::<io::Result<Vec<_>>>()?;
+        let (trials, tree) = (&*self, &*tree);
+        let lender = |(&(id, rung), kept): (&(u32, Rung), KeptOrBrick)| {
+            let (bytes, axis) = trials.encode_kept(tree, id, rung.codec(), kept);
+            let texels = decode(rung.codec(), &bytes, axis, &SequenceRange::default(), BrickRange::SEQUENCE);
+            let (mean, energy) = moments(&texels);
+            let extent = trials.ranges[id as usize].extent.to_f64() * f64::from(trials.sequence.span);
+            let norm = trials.cost(id as usize, rung).map_or(0.0, |cost| f64::from(cost.norm));
+            let trust = (1.0 - (norm / extent).powi(2) / energy.max(f64::MIN_POSITIVE)).max(0.0).sqrt();
+            Lender { id, texels, mean, energy, trust }
+        };
+        Ok(ids.par_iter().zip(kept).map(lender).collect())
     }
+}
+
+/// Mean, and sum of squared differences from it.
+fn moments(values: &[f32; BRICK_VOXELS]) -> (f64, f64) {
+    let mean = values.iter().map(|v| f64::from(*v)).sum::<f64>() / BRICK_VOXELS as f64;
+    (mean, values.iter().map(|v| (f64::from(*v) - mean).powi(2)).sum())
 }
 
 /// A shape's coarse values less their mean, over the root of the energy of all 512.
@@ -102,39 +111,31 @@ fn nearest(trials: &Trials, ids: &[u32], bricks: &[Brick], lenders: &[Lender]) -
     for (lender, mut row) in lenders.iter().zip(codebook.rows_mut()) {
         let row = row.as_slice_mut().expect("rows are contiguous");
         coarse(&lender.texels, lender.mean, lender.energy, row);
+        row.iter_mut().for_each(|v| *v *= lender.trust as f32);
     }
     let codebook = codebook.t();
     ids.par_chunks(ROWS)
         .zip(bricks.par_chunks(ROWS))
         .flat_map_iter(|(ids, bricks)| {
             let mut shapes = Array2::<f32>::zeros((bricks.len(), COARSE));
-            let mut moments = Vec::with_capacity(bricks.len());
             for (brick, mut row) in bricks.iter().zip(shapes.rows_mut()) {
-                let mean = brick.values.iter().map(|v| f64::from(*v)).sum::<f64>() / BRICK_VOXELS as f64;
-                let energy: f64 = brick.values.iter().map(|v| (f64::from(*v) - mean).powi(2)).sum();
+                let (mean, energy) = moments(&brick.values);
                 coarse(&brick.values, mean, energy, row.as_slice_mut().expect("rows are contiguous"));
-                moments.push((mean, energy));
             }
+            // The line through a shape leaves 1 - s² of a brick's energy: the most similar leaves the least.
             let similar = shapes.dot(&codebook);
-            let each = ids.iter().zip(bricks).zip(moments).zip(similar.rows());
-            each.map(|(((&id, brick), (mean, energy)), similar)| {
-                let mut closest: Vec<(f64, usize)> = Vec::with_capacity(CLOSEST + 1);
-                for (j, (lender, &similar)) in lenders.iter().zip(similar).enumerate() {
-                    let similar = f64::from(similar);
-                    if similar <= 0.0 || lender.id == id {
-                        continue;
-                    }
-                    // What the line through the shape leaves, and the lender's own error stretched.
-                    let gain = similar * similar * energy / lender.energy;
-                    let error = energy * (1.0 - similar * similar) + gain * lender.error;
-                    if closest.len() < CLOSEST || error < closest[CLOSEST - 1].0 {
-                        let at = closest.partition_point(|(e, _)| *e <= error);
-                        closest.insert(at, (error, j));
-                        closest.truncate(CLOSEST);
+            let each = ids.iter().zip(bricks).zip(similar.rows());
+            each.map(|((&id, brick), similar)| {
+                let mut closest = [(0.0f32, usize::MAX); CLOSEST];
+                for (j, &similar) in similar.iter().enumerate() {
+                    if similar > closest[CLOSEST - 1].0 && lenders[j].id != id {
+                        let at = closest.partition_point(|(s, _)| *s >= similar);
+                        closest[at..].rotate_right(1);
+                        closest[at] = (similar, j);
                     }
                 }
-                let mut loans: Vec<Loan> =
-                    closest.iter().filter_map(|&(_, j)| trials.borrow(brick, mean, &lenders[j])).collect();
+                let found = closest.iter().filter_map(|&(_, j)| lenders.get(j));
+                let mut loans: Vec<Loan> = found.filter_map(|lender| trials.borrow(brick, lender)).collect();
                 loans.sort_by(|a, b| a.cost.norm.total_cmp(&b.cost.norm));
                 loans
             })
@@ -145,7 +146,8 @@ fn nearest(trials: &Trials, ids: &[u32], bricks: &[Brick], lenders: &[Lender]) -
 
 impl Trials {
     /// The brick as a line through a lender's texels; `None` if it runs the other way.
-    fn borrow(&self, brick: &Brick, mean: f64, lender: &Lender) -> Option<Loan> {
+    fn borrow(&self, brick: &Brick, lender: &Lender) -> Option<Loan> {
+        let (mean, _) = moments(&brick.values);
         let pairs = brick.values.iter().zip(lender.texels.iter());
         let product: f64 =
             pairs.clone().map(|(v, t)| (f64::from(*v) - mean) * (f64::from(*t) - lender.mean)).sum();
@@ -162,7 +164,7 @@ impl Trials {
         }
         let range = BrickRange { min: min as u16, extent };
         let decoded = std::array::from_fn(|i| self.sequence.decode(range, lender.texels[i]));
-        let cost = self.measure(brick, &crate::volume::Mask512::ALL, &decoded, None);
+        let cost = self.measure(brick, &Mask512::ALL, &decoded, None);
         Some(Loan { lender: lender.id, range, cost })
     }
 

@@ -220,14 +220,31 @@ impl Trials {
 
     /// The texels of a brick in a codec that was tried on it, and their packing axis.
     pub fn texels_of(&mut self, tree: &mut SequenceTree, id: u32, codec: Codec) -> io::Result<(Vec<u8>, u8)> {
+        let kept = self.kept_or_brick(tree, id, codec)?;
+        Ok(self.encode_kept(tree, id, codec, kept))
+    }
+
+    /// What [`Trials::encode_kept`] makes texels of: all that has to be read, which one thread does at a time.
+    pub fn kept_or_brick(&mut self, tree: &mut SequenceTree, id: u32, codec: Codec) -> io::Result<KeptOrBrick> {
         if self.kept.holds(codec) {
-            return self.kept.get(id);
+            let (bytes, axis) = self.kept.get(id)?;
+            return Ok(KeptOrBrick::Kept(bytes, axis));
         }
         let mut brick = Vec::with_capacity(1);
         tree.pool.read(id..id + 1, &mut brick)?;
-        let texels = self.texels(tree, id as usize, &brick[0]);
-        let encoded = encode(codec, &self.sequence, &[texels]).expect("its values were within f16 when it was tried");
-        Ok((encoded.bytes, encoded.axes[0]))
+        Ok(KeptOrBrick::Brick(Box::new(brick.remove(0))))
+    }
+
+    /// A brick's texels and their packing axis.
+    pub fn encode_kept(&self, tree: &SequenceTree, id: u32, codec: Codec, kept: KeptOrBrick) -> (Vec<u8>, u8) {
+        match kept {
+            KeptOrBrick::Kept(bytes, axis) => (bytes, axis),
+            KeptOrBrick::Brick(brick) => {
+                let texels = [self.texels(tree, id as usize, &brick)];
+                let encoded = encode(codec, &self.sequence, &texels).expect("f16 was tried on it");
+                (encoded.bytes, encoded.axes[0])
+            }
+        }
     }
 
     /// Tries BC7 on some bricks, ascending, and keeps their texels. `advance` hears of each that is done.
@@ -259,6 +276,12 @@ impl Trials {
         }
         Ok(())
     }
+}
+
+/// A brick's texels, or the brick itself where they were not kept.
+pub(super) enum KeptOrBrick {
+    Kept(Vec<u8>, u8),
+    Brick(Box<Brick>),
 }
 
 /// The mean of the voxels that texels would give.

@@ -1,0 +1,110 @@
+//! Similar bricks made one by k-means, as the Utrecht thesis does it (4.5 and 5.3): of bricks that vary little, all
+//! of a cluster take the values of its centroid.
+
+use ndarray::ArrayView2;
+use rayon::prelude::*;
+
+use super::kmeans::{KMeansSettings, kmeans};
+use super::{AllocateError, Allocation, Coding, Shape, uniform};
+use crate::codec::{BrickRange, Codec, SequenceRange, Texels, decode, encode};
+use crate::settings::{Clustering, RangeMode};
+use crate::stages::dedup::{SequenceTree, carried};
+use crate::volume::{BRICK_VOXELS, Brick, Mask512};
+
+/// Bricks that are read at a time.
+const BRICKS_IN_FLIGHT: usize = 4096;
+
+/// Gives every brick of `tree` one codec, and clusters those of little variance. The voxels of those are in memory
+/// together: 2 KB a brick.
+///
+/// # Errors
+/// [`AllocateError`]; its grid is 0.
+pub fn clustered(
+    tree: &mut SequenceTree,
+    codec: Codec,
+    mode: RangeMode,
+    clustering: &Clustering,
+) -> Result<Allocation, AllocateError> {
+    let mut allocation = uniform(tree, codec, mode).ok_or(AllocateError::TooWide { grid: 0 })?;
+    let sequence = allocation.sequence;
+    let (mut ids, mut points) = (Vec::new(), Vec::new());
+    let all: Vec<u32> = (0..tree.pool.len()).collect();
+    let mut bricks = Vec::new();
+    for window in all.chunks(BRICKS_IN_FLIGHT) {
+        bricks.clear();
+        tree.pool.read_each(window, &mut bricks)?;
+        for (&id, brick) in window.iter().zip(&bricks) {
+            if variance(brick) <= clustering.variance {
+                ids.push(id);
+                points.extend(brick.values.iter().map(|v| fraction(&sequence, *v)));
+            }
+        }
+    }
+    let points = ArrayView2::from_shape((ids.len(), BRICK_VOXELS), &points).expect("512 values a brick");
+    let found = kmeans(
+        points,
+        &KMeansSettings {
+            clusters: clustering.clusters as usize,
+            iterations: clustering.iterations as usize,
+            seed: clustering.seed,
+        },
+    );
+
+    let centroids: Vec<Texels> =
+        found.centroids.rows().into_iter().map(|row| texels(&sequence, mode, &row.to_vec())).collect();
+    let encoded = encode(codec, &sequence, &centroids)
+        .map_err(|source| AllocateError::OutOfRange { grid: 0, source })?;
+    let size = codec.layout().brick_bytes();
+    allocation.shapes = encoded
+        .bytes
+        .chunks_exact(size)
+        .zip(encoded.axes)
+        .map(|(bytes, axis)| Shape { codec, bytes: bytes.to_vec(), axis })
+        .collect();
+    let decoded: Vec<_> = allocation
+        .shapes
+        .par_iter()
+        .zip(&centroids)
+        .map(|(shape, texels)| decode(codec, &shape.bytes, shape.axis, &sequence, texels.range))
+        .collect();
+
+    let rules = tree.brick_rules();
+    for (ids, members) in ids.chunks(BRICKS_IN_FLIGHT).zip(found.members.chunks(BRICKS_IN_FLIGHT)) {
+        bricks.clear();
+        tree.pool.read_each(ids, &mut bricks)?;
+        for ((&id, &member), brick) in ids.iter().zip(members).zip(&bricks) {
+            let (id, values) = (id as usize, &decoded[member as usize]);
+            let square = |i: usize| (f64::from(values[i]) - f64::from(brick.values[i])).powi(2);
+            allocation.norms[id] = carried(brick, rules[id]).ones().map(square).sum::<f64>().sqrt() as f32;
+            allocation.codings[id] = Coding::Shared(member);
+            allocation.ranges[id] = centroids[member as usize].range;
+        }
+    }
+    Ok(allocation)
+}
+
+/// The variance of a brick's values once they are stretched to 0..1: so a faint brick counts as a dense one does.
+fn variance(brick: &Brick) -> f64 {
+    let values = || brick.values.iter().map(|v| f64::from(*v));
+    let (min, max) = (values().fold(f64::INFINITY, f64::min), values().fold(f64::NEG_INFINITY, f64::max));
+    let extent = if max > min { max - min } else { 1.0 };
+    let stretched = || values().map(|v| (v - min) / extent);
+    let mean = stretched().sum::<f64>() / BRICK_VOXELS as f64;
+    stretched().map(|v| (v - mean).powi(2)).sum::<f64>() / BRICK_VOXELS as f64
+}
+
+fn fraction(sequence: &SequenceRange, value: f32) -> f32 {
+    ((f64::from(value) - f64::from(sequence.lo)) / f64::from(sequence.span)) as f32
+}
+
+/// A centroid as a brick of its own.
+fn texels(sequence: &SequenceRange, mode: RangeMode, centroid: &[f32]) -> Texels {
+    let value = |i: usize| (f64::from(sequence.lo) + f64::from(sequence.span) * f64::from(centroid[i])) as f32;
+    let values: [f32; BRICK_VOXELS] = std::array::from_fn(value);
+    let (min, max) = (values.iter().copied().fold(f32::INFINITY, f32::min), values.iter().copied().fold(f32::NEG_INFINITY, f32::max));
+    let range = match mode {
+        RangeMode::Sequence => BrickRange::SEQUENCE,
+        RangeMode::Brick => sequence.fit(min, max),
+    };
+    Texels { values, carried: Mask512::ALL, range }
+}
