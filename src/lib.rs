@@ -16,6 +16,7 @@
 //! - [`pipeline`] strings the stages together, [`manifest`] says with what [`settings`].
 //! - [`verify`] compares a finished pack with its source, [`report`] puts files into figures.
 //! - [`render`] traces pictures of packs and sources, on the CPU and through wgpu.
+//! - [`sweep`] measures many settings side by side, and how steady each is.
 //! - [`cli`] is the command line.
 //!
 //! To build a pack:
@@ -48,6 +49,7 @@ pub mod render;
 pub mod report;
 pub mod settings;
 pub mod stages;
+pub mod sweep;
 pub mod vdb;
 pub mod verify;
 pub mod volume;

@@ -17,6 +17,7 @@ use crate::stages::quantise::QuantiseError;
 use crate::stages::select::{SelectedGrid, Selection, find, select};
 use crate::stages::serialise::{FrameInput, GridInput, SerialiseError, serialise, tree_bytes};
 use crate::vdb::{GridClass, VdbFile, voxel_size};
+use crate::volume::FlatFrame;
 use crate::verify::{self, PictureSettings, Sources, VerifyReport};
 
 /// How much a finished pack is checked.
@@ -87,6 +88,19 @@ pub struct Outcome {
 /// The first thing that is wrong, with its file and grid. A report that is not ok is no error. In both
 /// cases the output is what it was before.
 pub fn build(job: &Job, progress: &mut dyn Progress) -> Result<Outcome> {
+    build_altered(job, &|_| (), progress)
+}
+
+/// The same from frames that pass through `alter` first, for measurements on input that is in no file. What is
+/// altered cannot be verified against its files.
+///
+/// # Errors
+/// As [`build`].
+pub fn build_altered(
+    job: &Job,
+    alter: &(dyn Fn(&mut FlatFrame) + Sync),
+    progress: &mut dyn Progress,
+) -> Result<Outcome> {
     check_output(job)?;
     let mut clock = Clock::new();
     progress.stage("metadata", job.frames.len() as u64, "files");
@@ -102,7 +116,7 @@ pub fn build(job: &Job, progress: &mut dyn Progress) -> Result<Outcome> {
     clock.lap("metadata");
 
     progress.stage("flatten", sequence.frames.len() as u64, "frames");
-    let trees = flatten_and_dedup(&sequence, &selection, &job.settings, progress)?;
+    let trees = flatten_and_dedup(&sequence, &selection, &job.settings, alter, progress)?;
     clock.lap("flatten and dedup");
 
     let each = selection.grids.iter().zip(trees);
@@ -213,6 +227,7 @@ fn flatten_and_dedup(
     sequence: &SequenceInfo,
     selection: &Selection,
     settings: &Settings,
+    alter: &(dyn Fn(&mut FlatFrame) + Sync),
     progress: &mut dyn Progress,
 ) -> Result<Vec<SequenceTree>> {
     let scratch = |e| Error::io(std::env::temp_dir())(e);
@@ -225,7 +240,8 @@ fn flatten_and_dedup(
         let flat: Vec<_> = window.par_iter().map(|f| flatten_frame(f, selection, settings)).collect();
         for (frame, flat) in window.iter().zip(flat) {
             for ((tree, grid), flat) in trees.iter_mut().zip(&selection.grids).zip(flat?) {
-                let Some(flat) = flat else { continue };
+                let Some(mut flat) = flat else { continue };
+                alter(&mut flat.frame);
                 tree.add(flat).map_err(|e| match e {
                     DedupError::Scratch { source } => scratch(source),
                     DedupError::Background { .. } => Error::Input(format!(

@@ -5,6 +5,7 @@ mod inspect;
 mod progress;
 mod render;
 mod style;
+mod sweep;
 mod verify;
 
 use std::path::PathBuf;
@@ -63,6 +64,8 @@ enum Command {
     Verify(verify::VerifyArgs),
     /// Trace pictures of a pack
     Render(render::RenderArgs),
+    /// Measure many settings of a volume and chart quality against size and speed
+    Sweep(sweep::SweepArgs),
 }
 
 /// How a pack is made, for builds without a manifest.
@@ -187,6 +190,7 @@ pub fn run(cli: Cli) -> Result<()> {
         Command::Inspect(args) => inspect::run(&args),
         Command::Verify(args) => verify::run(&args, cli.common),
         Command::Render(args) => render::run(&args, cli.common),
+        Command::Sweep(args) => sweep::run(&args, cli.common),
     }
 }
 

@@ -1,5 +1,6 @@
 //! What files hold, as people and machines read it.
 
+pub mod chart;
 mod pack;
 mod vdb;
 

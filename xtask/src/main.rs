@@ -4,12 +4,14 @@
 //! peers from Debian (`libopenvdb-dev libboost-dev libtbb-dev libimath-dev g++`) or volumes of your own.
 
 mod formats;
+mod kmeans;
 mod mutate;
 mod openvdb;
 mod peers;
 mod pictures;
 mod read;
 mod sequence;
+mod size;
 mod trace;
 
 use std::error::Error;
@@ -48,6 +50,10 @@ enum Bench {
     /// Every format and range on each volume: bytes, PSNR, largest error, seconds; and the tree beside
     /// the thesis's layout
     Formats(formats::Args),
+    /// K-means of all bricks of a sequence beside linfa's own fit
+    Kmeans(kmeans::Args),
+    /// Bytes at equal PSNR beside NanoVDB's FpN and beside uniform bc7
+    Size(size::Args),
     /// What each format costs the eye: FLIP, PSNR and RMSE of pictures of pack and source
     Pictures(pictures::Args),
     /// Milliseconds a frame on a GPU: every format, DDA and HDDA, at 1920 × 1080
@@ -58,6 +64,8 @@ fn main() -> Result<(), Box<dyn Error>> {
     match Cli::parse().task {
         Task::Bench(Bench::Read(args)) => read::bench(&args),
         Task::Bench(Bench::Formats(args)) => formats::bench(&args),
+        Task::Bench(Bench::Kmeans(args)) => kmeans::bench(&args),
+        Task::Bench(Bench::Size(args)) => size::bench(&args),
         Task::Bench(Bench::Pictures(args)) => pictures::bench(&args),
         Task::Bench(Bench::Trace(args)) => trace::bench(&args),
         Task::CheckOpenvdb { files } => openvdb::check(&files),

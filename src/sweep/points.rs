@@ -1,0 +1,261 @@
+//! One figure a setting: size, quality, build seconds, trace milliseconds.
+
+use std::path::Path;
+use std::time::Instant;
+
+use super::field::{Bricks, Jumps};
+use super::nanovdb::{self, NanoError, Quantise};
+use super::{Method, Options, Skipped, Sweep, each};
+use crate::error::{Error, Result};
+use crate::pack::Pack;
+use crate::pipeline::{Progress, Silent, build};
+use crate::render::gpu::Gpu;
+use crate::render::{Mode, Scene, View};
+use crate::report::PackSummary;
+use crate::report::chart::Point;
+use crate::stages::flatten::flatten;
+use crate::stages::select::find;
+use crate::vdb::{Accessor, GridClass, GridInfo, Tree, VdbFile, with_scalar_type};
+use crate::verify::{self, Sources};
+use crate::volume::{Coord, FlatFrame, ValueRange};
+
+/// Frames whose blockiness is measured: the first, the last and the one between, as for pictures.
+const BLOCKY_FRAMES: usize = 3;
+
+/// Tolerances of NanoVDB's FpN, as fractions of the range of values.
+const FPN: [f64; 6] = [0.1, 0.05, 0.02, 0.01, 0.005, 0.002];
+
+/// Measures every method, and NanoVDB beside them where its tool is installed.
+///
+/// # Errors
+/// When a source cannot be read or packed.
+pub fn measure(options: &Options, progress: &mut dyn Progress) -> Result<Sweep> {
+    let scratch = tempfile::tempdir().map_err(Error::io(std::env::temp_dir()))?;
+    let gpu = options.trace.and_then(|_| Gpu::shared().ok());
+    let source = Source::read(options)?;
+    let methods = options.methods();
+    let (mut points, mut skipped) =
+        each(&methods, progress, |method| point(options, method, &source, scratch.path(), gpu))?;
+    if nanovdb::is_installed() {
+        progress.stage("NanoVDB", 3 + FPN.len() as u64, "settings");
+        for (method, setting, quantise) in peers(source.peak) {
+            match nano_point(options, &source, (method, &setting), &quantise, scratch.path()) {
+                Ok(point) => points.push(point),
+                Err(why) => {
+                    skipped.push(Skipped { method: format!("NanoVDB {method}"), setting, why: why.to_string() });
+                }
+            }
+            progress.advance(1);
+        }
+    }
+    Ok(Sweep { device: gpu.map(|gpu| gpu.name.clone()), points, skipped })
+}
+
+fn peers(peak: f64) -> Vec<(&'static str, String, Quantise)> {
+    let mut peers = vec![
+        ("fp4", "4 bits".to_owned(), Quantise::Fp4),
+        ("fp8", "8 bits".to_owned(), Quantise::Fp8),
+        ("fp16", "16 bits".to_owned(), Quantise::Fp16),
+    ];
+    peers.extend(FPN.map(|f| ("fpN", format!("tolerance {} %", f * 100.0), Quantise::FpN { absolute: f * peak })));
+    peers
+}
+
+/// What all methods are measured against.
+struct Source {
+    grid: String,
+    peak: f64,
+    /// Some frames, by their place among the files.
+    shown: Vec<(usize, Bricks)>,
+    jumps: Jumps,
+}
+
+impl Source {
+    fn read(options: &Options) -> Result<Self> {
+        let sequence = crate::stages::metadata::read(&options.frames)?;
+        let grids: Vec<String> = options.grid.iter().cloned().collect();
+        let selection = crate::stages::select::select(&sequence, &grids)?;
+        let grid = selection.grids[0].name.clone();
+        let count = sequence.frames.len();
+        let mut shown: Vec<usize> =
+            (0..BLOCKY_FRAMES.min(count)).map(|i| i * (count - 1) / (BLOCKY_FRAMES - 1)).collect();
+        shown.dedup();
+        let (mut range, mut jumps, mut kept) = (None, Jumps::default(), Vec::new());
+        for (i, frame) in sequence.frames.iter().enumerate() {
+            let Some(flat) = flat_frame(&frame.path, &grid, options)? else { continue };
+            range = ValueRange::union_all(range.into_iter().chain(flat.stats.active_range));
+            if shown.contains(&i) {
+                let bricks = Bricks::of_source(&flat);
+                jumps.add(&bricks.jumps());
+                kept.push((i, bricks));
+            }
+        }
+        let peak = range.map_or(0.0, |r| f64::from(r.max) - f64::from(r.min));
+        Ok(Self { grid, peak, shown: kept, jumps })
+    }
+}
+
+/// One frame of the source; `None` if it lacks the grid.
+pub(super) fn flat_frame(path: &Path, grid: &str, options: &Options) -> Result<Option<FlatFrame>> {
+    let file = VdbFile::open(path).map_err(Error::vdb(path))?;
+    let Some(info) = find(&file.grids, grid) else { return Ok(None) };
+    Ok(Some(flatten(&file, path, info, options.nonfinite)?.frame))
+}
+
+fn point(options: &Options, method: &Method, source: &Source, folder: &Path, gpu: Option<&Gpu>) -> Result<Point> {
+    let job = options.job(method, &options.frames, folder.join("sweep.volpack"));
+    let mut seconds = f64::INFINITY;
+    for _ in 0..options.repeats {
+        let start = Instant::now();
+        build(&job, &mut Silent)?;
+        seconds = seconds.min(start.elapsed().as_secs_f64());
+    }
+    let pack = Pack::open(&job.output).map_err(Error::pack(&job.output))?;
+    let report = verify::voxels(&pack, &Sources::find(&pack, &options.frames)?, |_| ())?;
+    let mut jumps = Jumps::default();
+    for (place, bricks) in &source.shown {
+        let Some(frame) = pack.grids[0].frames.iter().position(|f| f.record.source as usize == *place) else {
+            continue;
+        };
+        let decoded = pack.frame(0, frame).and_then(|reader| bricks.in_pack(&reader));
+        jumps.add(&decoded.map_err(Error::pack(&job.output))?.jumps());
+    }
+    let trace_ms = match (gpu, options.trace) {
+        (Some(gpu), Some(size)) => trace(gpu, &pack, size, options.repeats),
+        _ => None,
+    };
+    let summary = PackSummary::new(&pack);
+    let grid = &report.grids[0];
+    let failures = report.failures.first().map(|f| format!("verification failed: {f}"));
+    Ok(Point {
+        volume: options.name.clone(),
+        method: method.method.to_owned(),
+        setting: method.setting.clone(),
+        gpu_bytes: summary.gpu_bytes,
+        bits_per_voxel: summary.bits_per_voxel,
+        psnr: grid.active.psnr,
+        max_error: if grid.peak > 0.0 { grid.active.max_error / grid.peak } else { 0.0 },
+        build_seconds: seconds,
+        trace_ms,
+        blockiness: jumps.blockiness(&source.jumps),
+        failures: failures.into_iter().chain(super::blocky(&jumps, &source.jumps)).collect(),
+    })
+}
+
+/// The median milliseconds of the last frame's picture; `None` where the device cannot hold or time it.
+fn trace(gpu: &Gpu, pack: &Pack, size: [u32; 2], repeats: u32) -> Option<f64> {
+    let uploaded = gpu.upload(pack).ok()?;
+    let grid = &pack.grids[0];
+    let frame = grid.frames.len() - 1;
+    let bounds = pack.frame_tree(0, frame).bounds();
+    let mode = if grid.record.class == GridClass::LevelSet as u32 { Mode::Depth } else { Mode::Density };
+    let scene = Scene::new(grid, &grid.frames[frame], bounds, &View::default(), mode, size);
+    let (_, mut ms) = gpu.trace_timed(&uploaded, [0, frame as u32], bounds, &scene, repeats).ok()?;
+    ms.sort_by(f64::total_cmp);
+    ms.get(ms.len() / 2).copied()
+}
+
+/// A peer's figures, all frames together.
+fn nano_point(
+    options: &Options,
+    source: &Source,
+    (method, setting): (&str, &str),
+    quantise: &Quantise,
+    folder: &Path,
+) -> Result<Point, PeerError> {
+    let (nvdb, back) = (folder.join("peer.nvdb"), folder.join("peer.vdb"));
+    let (mut bytes, mut leaves, mut seconds) = (0, 0, 0.0);
+    let mut error = Difference::default();
+    for path in &options.frames {
+        let converted = nanovdb::convert(path, &source.grid, quantise, &nvdb)?;
+        bytes += converted.grid_bytes;
+        leaves += converted.leaf_count;
+        seconds += converted.seconds;
+        nanovdb::back_to_vdb(&nvdb, &back)?;
+        error.add(&difference(path, &back, &source.grid)?);
+    }
+    Ok(Point {
+        volume: options.name.clone(),
+        method: format!("NanoVDB {method}"),
+        setting: setting.to_owned(),
+        gpu_bytes: bytes,
+        bits_per_voxel: bytes as f64 * 8.0 / (512.0 * leaves as f64),
+        psnr: error.psnr(source.peak),
+        max_error: error.max / source.peak,
+        build_seconds: seconds,
+        trace_ms: None,
+        blockiness: f64::NAN,
+        failures: Vec::new(),
+    })
+}
+
+/// Why a peer has no figure.
+#[derive(Debug, thiserror::Error)]
+pub enum PeerError {
+    /// Its tool failed.
+    #[error(transparent)]
+    Tool(#[from] NanoError),
+    /// A file cannot be read.
+    #[error(transparent)]
+    File(#[from] Error),
+}
+
+/// Errors over active leaf voxels.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Difference {
+    /// Active leaf voxels.
+    pub voxels: u64,
+    /// Sum of squared differences.
+    pub squares: f64,
+    /// The largest difference.
+    pub max: f64,
+}
+
+impl Difference {
+    /// Adds another frame's.
+    pub fn add(&mut self, other: &Self) {
+        self.voxels += other.voxels;
+        self.squares += other.squares;
+        self.max = self.max.max(other.max);
+    }
+
+    /// In dB under `peak`; `None` where there is no error.
+    pub fn psnr(&self, peak: f64) -> Option<f64> {
+        (self.squares > 0.0).then(|| 10.0 * (self.voxels as f64 * peak * peak / self.squares).log10())
+    }
+}
+
+/// How far a grid of one OpenVDB file is from that of another, over the first one's active leaf voxels.
+///
+/// # Errors
+/// When a file cannot be read or lacks the grid.
+pub fn difference(source: &Path, other: &Path, grid: &str) -> Result<Difference> {
+    let open = |path: &Path| VdbFile::open(path).map_err(Error::vdb(path));
+    let (source_file, other_file) = (open(source)?, open(other)?);
+    let info = |file: &VdbFile, path: &Path| -> Result<GridInfo> {
+        let found = find(&file.grids, grid).cloned();
+        found.ok_or_else(|| Error::Input(format!("{}: there is no grid {grid:?}", path.display())))
+    };
+    let (a, b) = (info(&source_file, source)?, info(&other_file, other)?);
+    let theirs: Tree<f32> = other_file.read_tree(&b).map_err(Error::vdb(other))?;
+    let accessor = Accessor::new(&theirs);
+    let mut out = Difference::default();
+    with_scalar_type!(&a.value_type,
+        T => {
+            let tree = source_file.read_tree::<T>(&a).map_err(Error::vdb(source))?;
+            for leaf in 0..tree.leaves.len() {
+                for i in tree.leaves.masks[leaf].ones() {
+                    let at = tree.leaves.origins[leaf].offset_by(Coord::child_offset(i, 3, 1));
+                    let ours = crate::vdb::Scalar::to_f32(tree.leaves.values(leaf)[i]);
+                    let error = (f64::from(ours) - f64::from(accessor.get(at).0)).abs();
+                    out.voxels += 1;
+                    out.squares += error * error;
+                    out.max = out.max.max(error);
+                }
+            }
+        },
+        other => return Err(Error::Unsupported(format!("{}: grid {grid:?} is {}", source.display(), other.name())))
+    );
+    Ok(out)
+}
+
