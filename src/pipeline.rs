@@ -8,14 +8,14 @@ use rayon::prelude::*;
 use crate::error::{Error, Result};
 use crate::pack::{Pack, Provenance, Source};
 use crate::report::PackSummary;
-use crate::settings::{Format, Masks, Settings};
+use crate::settings::{Format, Masks, Quality, Settings};
 use crate::stages::allocate::{self, AdaptiveGrid, AllocateError, Allocation, Target};
 use crate::stages::dedup::{DedupError, MaskPolicy, SequenceTree};
 use crate::stages::flatten::{Flattened, flatten};
 use crate::stages::metadata::{self, FrameSource, SequenceInfo};
 use crate::stages::quantise::QuantiseError;
 use crate::stages::select::{SelectedGrid, Selection, find, select};
-use crate::stages::serialise::{FrameInput, GridInput, SerialiseError, serialise, tree_bytes};
+use crate::stages::serialise::{FrameInput, GridInput, SerialiseError, gpu_bytes, serialise, tree_bytes};
 use crate::vdb::{GridClass, VdbFile, voxel_size};
 use crate::volume::FlatFrame;
 use crate::verify::{self, PictureSettings, Sources, VerifyReport};
@@ -338,7 +338,24 @@ fn allocate_all(grids: &mut [GridInput], settings: &Settings, progress: &mut dyn
     let allocations = allocate::adaptive(&mut candidates, &target, &mut |bricks| progress.advance(bricks));
     let allocations = allocations.map_err(|e| allocate_error(e, grids))?;
     grids.iter_mut().zip(allocations).for_each(|(grid, allocation)| grid.allocation = allocation);
-    Ok(())
+    check_size(grids, settings.quality)
+}
+
+/// A size that the coarsest choice does not meet is an error that names the least.
+fn check_size(grids: &[GridInput], quality: Quality) -> Result<()> {
+    let leaves: u64 = grids.iter().flat_map(|g| &g.tree.frames).map(|f| f.stats.leaves).sum();
+    let bits_of = |bytes: u64| bytes as f64 / (64.0 * leaves as f64);
+    let bytes = gpu_bytes(grids).map_err(|e| Error::Unsupported(e.to_string()))?;
+    match quality {
+        Quality::Size(asked) if bytes > asked => Err(Error::Usage(format!(
+            "size: {asked} bytes on the GPU cannot be reached, the least is {bytes}: raise it, or pack fewer frames"
+        ))),
+        Quality::BitsPerVoxel(asked) if bits_of(bytes) > asked => Err(Error::Usage(format!(
+            "bits_per_voxel: {asked} cannot be reached, the least is {:.4}: raise it, or pack fewer frames",
+            bits_of(bytes)
+        ))),
+        _ => Ok(()),
+    }
 }
 
 fn allocate_error(error: AllocateError, grids: &[GridInput]) -> Error {
@@ -349,7 +366,6 @@ fn allocate_error(error: AllocateError, grids: &[GridInput]) -> Error {
             grids[grid].name
         )),
         AllocateError::OutOfRange { grid, source } => Error::OutOfRange { grid: grids[grid].name.clone(), source },
-        AllocateError::TooSmall { .. } => Error::Usage(error.to_string()),
     }
 }
 

@@ -76,7 +76,7 @@ class Pack:
         grids, frames, names, atlases, tree = (b"".join(map(self.chunk, own[kind, 0])) for kind in (1, 2, 3, 4, 6))
         self.tree, self.reals = (struct.unpack(f"<{len(tree) // 4}{form}", tree) for form in "If")
         self.atlases = {tag: (*size, own[7, tag].start) for tag, *size in struct.iter_unpack("<I4x2I8x", atlases)}
-        numbers, self.grids = tuple(number for number, in struct.iter_unpack("<4xi184x", frames)), []
+        numbers, self.grids = tuple(number for number, in struct.iter_unpack("<4xi192x", frames)), []
         for at, length, first, count in struct.iter_unpack("<II4xII36x", grids):
             head = struct.unpack_from("<3i6I3fI", tree, 4 * self.tree[2] + 64 * len(self.grids))
             self.grids.append(Grid(names[at:at + length].decode(), numbers[first:first + count],

@@ -120,8 +120,13 @@ pub fn print_sizes(p: &PackSummary) {
     let frames = if p.frames == 1 { "frame" } else { "frames" };
     outln!("  {} {frames}, {} bricks, {} unique", count(p.frames), count(p.bricks), count(p.unique_bricks));
     for (codec, c) in &p.codecs {
-        let texels = if c.bytes > 0 { format!("  {}", bytes(c.bytes)) } else { String::new() };
-        outln!("    {codec:9} {:>10} bricks{texels}", count(c.bricks));
+        outln!(
+            "    {codec:9} {:>10} bricks  {:>10}  {:5.1} % of texels  {:5.1} % of error",
+            count(c.bricks),
+            bytes(c.bytes),
+            100.0 * c.share_of_bytes,
+            100.0 * c.share_of_error
+        );
     }
     outln!(
         "  GPU {}: tree {}, masks {}, texels {}; {:.3} bits a voxel",

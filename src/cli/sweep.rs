@@ -120,7 +120,7 @@ fn write_sweep(options: &Options, sweep: &Sweep, folder: &Path) -> Result<Vec<St
             p.max_error.to_string(),
             p.build_seconds.to_string(),
             optional(p.trace_ms),
-            p.blockiness.to_string(),
+            optional(p.blockiness),
             r.front_in_size.to_string(),
             r.front_in_seconds.to_string(),
             r.front_in_trace.to_string(),

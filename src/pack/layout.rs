@@ -167,9 +167,11 @@ pub struct FrameRecord {
     pub chunks: u32,
     /// The active voxels' box: minimum, then maximum, inclusive. Empty if a minimum is above.
     pub bbox: [i32; 6],
-    /// What encoding cost: the root of the sum of squared errors over every voxel of the frame that a
-    /// texel gives.
-    pub error_norm: f32,
+    /// Zero.
+    pub reserved: u32,
+    /// What encoding cost: the root of the sum of squared errors over every voxel of the frame's bricks that no
+    /// rule gives, and of bricks that became background.
+    pub error_norm: f64,
     /// Leaves of the source's tree.
     pub leaves: u64,
     /// Active voxels of the source, tiles in full.
@@ -201,6 +203,6 @@ const _: () = {
     assert!(size_of::<Section>() == 80);
     assert!(size_of::<Chunk>() == 48);
     assert!(size_of::<GridRecord>() == 56);
-    assert!(size_of::<FrameRecord>() == 192);
+    assert!(size_of::<FrameRecord>() == 200);
     assert!(size_of::<AtlasRecord>() == 24);
 };

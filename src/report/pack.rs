@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet, HashSet};
 use serde::Serialize;
 
 use crate::codec::Codec;
-use crate::pack::Pack;
+use crate::pack::{Atlas, Pack};
 use crate::pack::tree::{MASK_WORDS, RECORD_WORDS, header};
 
 /// A pack's sizes and counts.
@@ -46,6 +46,10 @@ pub struct CodecSummary {
     pub bricks: u64,
     /// Bytes of their texture pages.
     pub bytes: u64,
+    /// Those as a part of all texture pages.
+    pub share_of_bytes: f64,
+    /// The squared error of their voxels as a part of the pack's, each grid against its own range of values.
+    pub share_of_error: f64,
 }
 
 impl PackSummary {
@@ -64,6 +68,19 @@ impl PackSummary {
             codecs.entry(atlas.codec.name()).or_default().bytes = atlas.bytes();
         }
 
+        let squares = squares_by_codec(pack);
+        let error: f64 = squares.iter().sum();
+        let texels: u64 = pack.atlases.iter().map(Atlas::bytes).sum();
+        let part = |part: f64, whole: f64| if whole > 0.0 { part / whole } else { 0.0 };
+        for (tag, squares) in squares.into_iter().enumerate() {
+            let codec = Codec::from_tag(tag as u32).expect("there are six");
+            if squares > 0.0 || codecs.contains_key(codec.name()) {
+                let entry = codecs.entry(codec.name()).or_default();
+                entry.share_of_bytes = part(entry.bytes as f64, texels as f64);
+                entry.share_of_error = part(squares, error);
+            }
+        }
+
         let frames: BTreeSet<i32> =
             pack.grids.iter().flat_map(|g| g.frames.iter().map(|f| f.record.number)).collect();
         // Nothing in a pack bounds what it says of its source.
@@ -71,7 +88,7 @@ impl PackSummary {
         let source_leaves = leaves.fold(0, u64::saturating_add);
         let mask_bytes = u64::from(words[header::MASKS]) * MASK_WORDS as u64 * 4;
         let tree_bytes = words.len() as u64 * 4 - mask_bytes;
-        let texel_bytes = pack.atlases.iter().map(crate::pack::Atlas::bytes).sum();
+        let texel_bytes = texels;
         let gpu_bytes = tree_bytes + mask_bytes + texel_bytes;
         Self {
             grids: pack.grids.iter().map(|g| g.name.clone()).collect(),
@@ -93,4 +110,21 @@ impl PackSummary {
             source_leaves,
         }
     }
+}
+
+/// What each codec cost, by tag, in squared ranges of each grid's active values.
+fn squares_by_codec(pack: &Pack) -> [f64; 6] {
+    let mut squares = [0.0; 6];
+    for grid in &pack.grids {
+        let peak = f64::from(grid.record.active_max) - f64::from(grid.record.active_min);
+        for (sum, norm) in squares.iter_mut().zip(grid.record.codec_norms) {
+            let norm = f64::from(norm);
+            // Where all active values are one there is no range to measure by.
+            let relative = if peak > 0.0 { norm / peak } else { norm };
+            if relative.is_finite() {
+                *sum += relative * relative;
+            }
+        }
+    }
+    squares
 }

@@ -42,7 +42,7 @@ pub struct Outcome {
     /// Its packing axis.
     pub axes: Vec<u8>,
     /// The root of the squared error over the voxels that its texels give, on the decoded value.
-    pub norms: Vec<f32>,
+    pub norms: Vec<f64>,
 }
 
 impl Outcome {
@@ -69,7 +69,7 @@ struct Encoded {
     bytes: Vec<u8>,
     axis: u8,
     /// Root of the squared error; `None` where it was known before.
-    norm: Option<f32>,
+    norm: Option<f64>,
 }
 
 /// Encodes every slab of an atlas in order. `finish` is applied to a slab's bytes on the thread that made
@@ -199,7 +199,7 @@ fn encode_bricks(
         } else {
             let decoded = decode(codec, bytes, axis, sequence, texels.range);
             let square = |i: usize| (f64::from(decoded[i]) - f64::from(brick.values[i])).powi(2);
-            texels.carried.ones().map(square).sum::<f64>().sqrt() as f32
+            texels.carried.ones().map(square).sum::<f64>().sqrt()
         };
         Encoded { bytes: bytes.to_vec(), axis, norm: Some(norm) }
     });

@@ -3,6 +3,7 @@
 //! `cargo run --release -p xtask -- help` lists the tasks. None of them is part of the tests: they need
 //! peers from Debian (`libopenvdb-dev libboost-dev libtbb-dev libimath-dev g++`) or volumes of your own.
 
+mod clusters;
 mod formats;
 mod kmeans;
 mod mutate;
@@ -15,7 +16,7 @@ mod size;
 mod trace;
 
 use std::error::Error;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use clap::{Parser, Subcommand};
 
@@ -30,6 +31,13 @@ enum Task {
     /// Measure, side by side with a peer or a setting
     #[command(subcommand)]
     Bench(Bench),
+    /// Draw the chart of a sweep anew from its JSON
+    Chart {
+        /// The `sweep.json` of a `volpack sweep`
+        json: PathBuf,
+        /// The SVG to write
+        svg: PathBuf,
+    },
     /// Compare what volpack reads with what OpenVDB reads, on any files
     CheckOpenvdb {
         /// OpenVDB files
@@ -50,6 +58,8 @@ enum Bench {
     /// Every format and range on each volume: bytes, PSNR, largest error, seconds; and the tree beside
     /// the thesis's layout
     Formats(formats::Args),
+    /// What clustering gives and costs: the columns of the thesis's figure 19
+    Clusters(clusters::Args),
     /// K-means of all bricks of a sequence beside linfa's own fit
     Kmeans(kmeans::Args),
     /// Bytes at equal PSNR beside NanoVDB's FpN and beside uniform bc7
@@ -64,12 +74,26 @@ fn main() -> Result<(), Box<dyn Error>> {
     match Cli::parse().task {
         Task::Bench(Bench::Read(args)) => read::bench(&args),
         Task::Bench(Bench::Formats(args)) => formats::bench(&args),
+        Task::Bench(Bench::Clusters(args)) => clusters::bench(&args),
         Task::Bench(Bench::Kmeans(args)) => kmeans::bench(&args),
         Task::Bench(Bench::Size(args)) => size::bench(&args),
         Task::Bench(Bench::Pictures(args)) => pictures::bench(&args),
         Task::Bench(Bench::Trace(args)) => trace::bench(&args),
+        Task::Chart { json, svg } => chart(&json, &svg),
         Task::CheckOpenvdb { files } => openvdb::check(&files),
         Task::Mutate(args) => mutate::run(args),
         Task::ReadOnce(args) => read::once(&args),
     }
+}
+
+fn chart(json: &Path, svg: &Path) -> Result<(), Box<dyn Error>> {
+    let sweep: serde_json::Value = serde_json::from_slice(&std::fs::read(json)?)?;
+    let points: Vec<volpack::report::chart::Point> = serde_json::from_value(sweep["points"].clone())?;
+    let text = |key: &str| sweep[key].as_str().unwrap_or_default().to_owned();
+    let subtitle = match sweep["device"].as_str() {
+        Some(device) => format!("{}; traced by {device} at {} × {}", text("machine"), sweep["trace"][0], sweep["trace"][1]),
+        None => text("machine"),
+    };
+    std::fs::write(svg, volpack::report::chart::sweep_svg(&text("volume"), &subtitle, &points)?)?;
+    Ok(())
 }

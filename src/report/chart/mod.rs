@@ -20,7 +20,7 @@ pub use stability::stability_svg;
 pub use sweep::sweep_svg;
 
 /// One measured setting.
-#[derive(Clone, Debug, serde::Serialize)]
+#[derive(Clone, Debug, serde::Deserialize, serde::Serialize)]
 pub struct Point {
     /// The volume that was measured.
     pub volume: String,
@@ -40,8 +40,8 @@ pub struct Point {
     pub build_seconds: f64,
     /// None where no GPU traced it.
     pub trace_ms: Option<f64>,
-    /// Mean jump across brick faces over mean jump inside, relative to the source's.
-    pub blockiness: f64,
+    /// Mean jump across brick faces over mean jump inside, relative to the source's; None where it was not measured.
+    pub blockiness: Option<f64>,
     /// Why it failed, e.g. "verification failed: signs flipped"; empty = fine.
     pub failures: Vec<String>,
 }

@@ -12,7 +12,7 @@ fn point(method: &str, setting: &str, bits: f64, psnr: Option<f64>) -> Point {
         max_error: 0.01,
         build_seconds: 0.0,
         trace_ms: None,
-        blockiness: 1.0,
+        blockiness: Some(1.0),
         failures: vec![],
     }
 }

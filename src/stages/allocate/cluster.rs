@@ -75,7 +75,7 @@ pub fn clustered(
         for ((&id, &member), brick) in ids.iter().zip(members).zip(&bricks) {
             let (id, values) = (id as usize, &decoded[member as usize]);
             let square = |i: usize| (f64::from(values[i]) - f64::from(brick.values[i])).powi(2);
-            allocation.norms[id] = carried(brick, rules[id]).ones().map(square).sum::<f64>().sqrt() as f32;
+            allocation.norms[id] = carried(brick, rules[id]).ones().map(square).sum::<f64>().sqrt();
             allocation.codings[id] = Coding::Shared(member);
             allocation.ranges[id] = centroids[member as usize].range;
         }

@@ -35,7 +35,7 @@ pub struct Allocation {
     pub shapes: Vec<Shape>,
     /// The root of the squared error of each brick over the voxels that its texels give, as far as it is
     /// known before texels are made: 0 where [`super::quantise`] will measure it.
-    pub norms: Vec<f32>,
+    pub norms: Vec<f64>,
     /// The squared error of each frame's empty bricks.
     pub empty_squares: Vec<f64>,
     /// Texels that were made to be tried.
@@ -84,19 +84,6 @@ pub enum AllocateError {
         grid: usize,
         /// The value.
         source: OutOfRange,
-    },
-    /// Not even the cheapest codecs are small enough.
-    #[error(
-        "{asked} bytes on the GPU cannot be reached: the least is {least}, of which {fixed} are tree and masks: \
-         raise size or bits_per_voxel, or pack fewer frames"
-    )]
-    TooSmall {
-        /// What was asked for.
-        asked: u64,
-        /// The least that there is.
-        least: u64,
-        /// The part of it that no codec changes.
-        fixed: u64,
     },
 }
 

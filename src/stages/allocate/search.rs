@@ -14,6 +14,7 @@ use super::share::{Loan, loans};
 use super::trial::{ConstantAim, Cost, Rung, Trials};
 use super::{AllocateError, Allocation, Coding, Shape};
 use crate::codec::Codec;
+use crate::pack::tree::NODE_WORDS;
 use crate::settings::{FRAME_MARGIN_DB, Quality, RangeMode};
 use crate::stages::dedup::{Payload, SequenceTree};
 use crate::stages::relayout;
@@ -169,8 +170,7 @@ impl<'a> GridSearch<'a> {
         self.in_peaks(brick, self.cost(brick, rung).norm)
     }
 
-    fn in_peaks(&self, brick: usize, norm: f32) -> f64 {
-        let norm = f64::from(norm);
+    fn in_peaks(&self, brick: usize, norm: f64) -> f64 {
         // Where all active values are the same, nothing but no error will do.
         let peak = if self.peak > 0.0 { self.peak } else { f64::MIN_POSITIVE };
         if norm == 0.0 { 0.0 } else { f64::from(self.uses[brick]) * (norm / peak) * (norm / peak) }
@@ -317,6 +317,21 @@ impl<'a> GridSearch<'a> {
         }
     }
 
+    /// The PSNR of all frames together.
+    fn whole(&self, picks: &[Rung]) -> f64 {
+        self.psnr(self.active_voxels, self.squares(picks))
+    }
+
+    /// That of the worst frame.
+    fn worst_frame(&self, picks: &[Rung]) -> f64 {
+        let frames = self.tree.frames.iter().map(|frame| {
+            let square = |id: u32| self.active_squares(id as usize, picks[id as usize]);
+            self.psnr(frame.stats.active_leaf_voxels, self.tree.frame_bricks(frame).map(square).sum())
+        });
+        // Where there is no error, or no voxel to err, there is no worst.
+        frames.filter(|db| db.is_finite()).fold(f64::INFINITY, f64::min)
+    }
+
     /// Binds the bricks of every frame below `floor` to the step at which it would reach it alone. Whether
     /// there was such a frame.
     fn raise_frames(&mut self, picks: &[Rung], floor: f64, advance: &mut dyn FnMut(u64)) -> io::Result<bool> {
@@ -327,7 +342,9 @@ impl<'a> GridSearch<'a> {
             let squares = |search: &Self, pick: &dyn Fn(usize) -> Rung| -> f64 {
                 bricks.iter().map(|&id| search.active_squares(id as usize, pick(id as usize))).sum()
             };
-            if squares(self, &|brick| picks[brick]) <= allowed {
+            // What no step meets is met as nearly as the last one does.
+            let bound = bricks.iter().all(|&id| self.least_step[id as usize] == LAST_STEP);
+            if bound || squares(self, &|brick| picks[brick]) <= allowed {
                 continue;
             }
             raised = true;
@@ -389,7 +406,7 @@ impl<'a> GridSearch<'a> {
         }
         allocation.tighten(self.tree);
         let is_empty = |id: u32| picks[id as usize] == Rung::Empty;
-        let square = |id: u32| f64::from(allocation.norms[id as usize]).powi(2);
+        let square = |id: u32| allocation.norms[id as usize].powi(2);
         let frames = self.tree.frames.iter();
         allocation.empty_squares =
             frames.map(|f| self.tree.frame_bricks(f).filter(|&id| is_empty(id)).map(square).sum()).collect();
@@ -436,44 +453,87 @@ fn switches(grid: usize, search: &GridSearch, coarse: &[Rung], fine: &[Rung]) ->
     switches
 }
 
-/// The finest choice that takes at most `limit` bytes, with one λ for all grids.
+/// The finest choice that takes at most `limit` bytes, with one λ for all grids; the coarsest if none does.
 fn at_size(
     searches: &mut [GridSearch],
     limit: u64,
     target: &Target,
     advance: &mut dyn FnMut(u64),
-) -> Result<Vec<Vec<Rung>>, AllocateError> {
-    let (step, alone) = at_size_with_loans(searches, limit, target, advance)?;
+) -> io::Result<Vec<Vec<Rung>>> {
+    let fixed = target.fixed_bytes;
+    let floors = match target.min_frame_psnr {
+        Some(floor) => vec![floor; searches.len()],
+        None => floors_at_size(searches, limit, fixed, advance)?,
+    };
+    let (step, alone) = at_size_above(searches, limit, fixed, &floors, advance)?;
     let squares = |searches: &[GridSearch], picks: &[Vec<Rung>]| -> f64 {
         let of_grid = |(s, picks): (&GridSearch, &Vec<Rung>)| s.squares(picks) / (s.peak * s.peak).max(f64::MIN_POSITIVE);
         searches.iter().zip(picks).map(of_grid).sum()
     };
-    let before = squares(searches, &alone);
     for (search, picks) in searches.iter_mut().zip(&alone) {
         search.find_loans(picks, step)?;
     }
-    let (_, together) = at_size_with_loans(searches, limit, target, advance)?;
-    if squares(searches, &together) < before {
+    let (_, together) = at_size_above(searches, limit, fixed, &floors, advance)?;
+    if squares(searches, &together) < squares(searches, &alone) && bytes(searches, &together, fixed) <= limit {
         return Ok(together);
     }
     searches.iter_mut().for_each(GridSearch::forget_loans);
     Ok(alone)
 }
 
-fn at_size_with_loans(
+/// Halvings of the way between the frames' worst PSNR and what they would have to reach.
+const FLOOR_HALVINGS: u32 = 6;
+
+/// The floors of each grid's frames at which none is further below the whole than [`FRAME_MARGIN_DB`]. What the worst
+/// frames gain the others lose, so the whole falls as a floor rises: it is searched for between where the worst frame
+/// is without one and where it would have to be if the whole stayed.
+fn floors_at_size(
     searches: &mut [GridSearch],
     limit: u64,
-    target: &Target,
+    fixed: u64,
     advance: &mut dyn FnMut(u64),
-) -> Result<(u32, Vec<Vec<Rung>>), AllocateError> {
-    let all = |searches: &[GridSearch], step| searches.iter().map(|s| s.picks(step)).collect::<Vec<_>>();
-    let bytes = |searches: &[GridSearch], picks: &[Vec<Rung>]| {
-        target.fixed_bytes + texel_bytes(&counts(picks)) - empty_bytes(searches, picks)
+) -> io::Result<Vec<f64>> {
+    let none = vec![f64::NEG_INFINITY; searches.len()];
+    let (_, free) = at_size_above(searches, limit, fixed, &none, advance)?;
+    let ends: Vec<(f64, f64)> =
+        searches.iter().zip(&free).map(|(s, p)| (s.worst_frame(p), s.whole(p) - FRAME_MARGIN_DB)).collect();
+    if ends.iter().all(|(worst, wanted)| worst >= wanted) {
+        return Ok(none);
+    }
+    let floors = |part: f64| -> Vec<f64> {
+        let between = |&(worst, wanted): &(f64, f64)| worst + part * (wanted - worst);
+        ends.iter().map(|e| if e.0 >= e.1 { f64::NEG_INFINITY } else { between(e) }).collect()
     };
-    let mut floors = true;
+    let (mut low, mut high, mut best, mut best_is_even) = (0.0, 1.0, none, false);
+    for _ in 0..FLOOR_HALVINGS {
+        let middle = f64::midpoint(low, high);
+        let (_, picks) = at_size_above(searches, limit, fixed, &floors(middle), advance)?;
+        let even = |(s, p): (&GridSearch, &Vec<Rung>)| s.worst_frame(p) >= s.whole(p) - FRAME_MARGIN_DB;
+        let is_even = searches.iter().zip(&picks).all(even);
+        let fits = bytes(searches, &picks, fixed) <= limit;
+        // The lowest floor that evens frames out, or else the highest that fits.
+        if fits && (is_even || !best_is_even) {
+            (best, best_is_even) = (floors(middle), is_even);
+        }
+        if fits && !is_even { low = middle } else { high = middle }
+    }
+    Ok(best)
+}
+
+/// The finest choice that takes at most `limit` bytes and has no frame below its grid's floor, and its step. Where
+/// nothing is small enough, the coarsest.
+fn at_size_above(
+    searches: &mut [GridSearch],
+    limit: u64,
+    fixed: u64,
+    floors: &[f64],
+    advance: &mut dyn FnMut(u64),
+) -> io::Result<(u32, Vec<Vec<Rung>>)> {
+    let all = |searches: &[GridSearch], step| searches.iter().map(|s| s.picks(step)).collect::<Vec<_>>();
+    searches.iter_mut().for_each(|s| s.least_step.fill(0));
     loop {
         // The first step that is too large: the one before is the last that fits.
-        let too_large = first_step(|step| bytes(searches, &all(searches, step)) > limit);
+        let too_large = first_step(|step| bytes(searches, &all(searches, step), fixed) > limit);
         let fits = too_large.saturating_sub(1);
         let mut unknown = false;
         for step in [fits, too_large] {
@@ -486,47 +546,39 @@ fn at_size_with_loans(
             continue;
         }
         let fine = all(searches, too_large);
-        if bytes(searches, &fine) <= limit {
-            return Ok((too_large, fine));
+        let mut picks = if bytes(searches, &fine, fixed) <= limit { fine.clone() } else { all(searches, fits) };
+        let mut order: Vec<Switch> = Vec::new();
+        for (g, (search, (coarse, fine))) in searches.iter().zip(picks.iter().zip(&fine)).enumerate() {
+            order.extend(switches(g, search, coarse, fine));
         }
-        let mut picks = all(searches, fits);
-        let least = bytes(searches, &picks);
-        if least > limit && floors && target.min_frame_psnr.is_none() {
-            // A floor that nobody named gives way to the size that somebody did.
-            floors = false;
-            searches.iter_mut().for_each(|s| s.least_step.fill(0));
-            continue;
-        }
-        if least > limit {
-            return Err(AllocateError::TooSmall { asked: limit, least, fixed: target.fixed_bytes });
-        }
-        let each = searches.iter().zip(&picks).zip(&fine).enumerate();
-        let mut order: Vec<Switch> =
-            each.flat_map(|(g, ((search, coarse), fine))| switches(g, search, coarse, fine)).collect();
         order.sort_by(|a, b| b.gain.total_cmp(&a.gain));
-        let (mut counts, mut empty) = (counts(&picks), empty_bytes(searches, &picks));
+        let (mut counts, mut saved) = (counts(&picks), saved_bytes(searches, &picks));
         for Switch { grid, brick, to, .. } in order {
             let from = picks[grid][brick];
             counts[from as usize] -= 1;
             counts[to as usize] += 1;
+            picks[grid][brick] = to;
             if from == Rung::Empty {
-                empty -= u64::from(searches[grid].records[brick] * RECORD_BITS / 8);
+                saved = saved_bytes(searches, &picks);
             }
-            if target.fixed_bytes + texel_bytes(&counts) - empty > limit {
+            if fixed + texel_bytes(&counts) - saved > limit {
+                picks[grid][brick] = from;
                 break;
             }
-            picks[grid][brick] = to;
         }
         let mut raised = false;
-        for (search, picks) in searches.iter_mut().zip(&picks).filter(|_| floors) {
-            let whole = search.psnr(search.active_voxels, search.squares(picks));
-            let floor = target.min_frame_psnr.unwrap_or(whole - FRAME_MARGIN_DB);
+        for ((search, picks), &floor) in searches.iter_mut().zip(&picks).zip(floors) {
             raised |= search.raise_frames(picks, floor, advance)?;
         }
         if !raised {
             return Ok((fits, picks));
         }
     }
+}
+
+/// What tree, masks and texels take together.
+fn bytes(searches: &[GridSearch], picks: &[Vec<Rung>], fixed: u64) -> u64 {
+    fixed + texel_bytes(&counts(picks)) - saved_bytes(searches, picks)
 }
 
 /// How many bricks each rung has.
@@ -542,11 +594,18 @@ fn texel_bytes(counts: &[u32; Rung::ALL.len()]) -> u64 {
     Rung::ALL.into_iter().filter(|rung| rung.codec() != Codec::Constant).map(bytes).sum()
 }
 
-/// The records that empty bricks do without.
-fn empty_bytes(searches: &[GridSearch], picks: &[Vec<Rung>]) -> u64 {
+/// What empty bricks do without: their records, and nodes of which nothing is left.
+fn saved_bytes(searches: &[GridSearch], picks: &[Vec<Rung>]) -> u64 {
     let of_grid = |(search, picks): (&GridSearch, &Vec<Rung>)| {
         let empty = picks.iter().zip(&search.records).filter(|(rung, _)| **rung == Rung::Empty);
-        empty.map(|(_, records)| u64::from(records * RECORD_BITS / 8)).sum::<u64>()
+        let records: u64 = empty.map(|(_, records)| u64::from(records * RECORD_BITS / 8)).sum();
+        let tree = &*search.tree;
+        let is_empty = |&record: &u32| match tree.records[record as usize].payload {
+            Payload::Brick(id) => picks[id as usize] == Rung::Empty,
+            Payload::Constant(_) => false,
+        };
+        let nodes = tree.nodes.items().iter().filter(|node| node.entries(&tree.runs).iter().all(is_empty));
+        records + nodes.count() as u64 * NODE_WORDS as u64 * 4
     };
     searches.iter().zip(picks).map(of_grid).sum()
 }

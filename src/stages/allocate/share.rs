@@ -80,7 +80,7 @@ impl Trials {
             let texels = decode(rung.codec(), &bytes, axis, &SequenceRange::default(), BrickRange::SEQUENCE);
             let (mean, energy) = moments(&texels);
             let extent = trials.ranges[id as usize].extent.to_f64() * f64::from(trials.sequence.span);
-            let norm = trials.cost(id as usize, rung).map_or(0.0, |cost| f64::from(cost.norm));
+            let norm = trials.cost(id as usize, rung).map_or(0.0, |cost| cost.norm);
             let trust = (1.0 - (norm / extent).powi(2) / energy.max(f64::MIN_POSITIVE)).max(0.0).sqrt();
             Lender { id, texels, mean, energy, trust }
         };

@@ -56,13 +56,12 @@ impl Rung {
 /// Rungs that may err.
 const LOSSY: usize = Rung::F32 as usize;
 
-/// What one codec does to one brick. Roots of sums rather than sums, so that the squares of values near the
-/// ends of `f32` fit.
+/// What one codec does to one brick. Roots of sums rather than sums, so that `f32` is enough for what only decides.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Cost {
     /// Root of the squared error over the voxels that texels give; infinite where the codec is out of the
     /// question.
-    pub norm: f32,
+    pub norm: f64,
     /// The same over active voxels.
     pub active_norm: f32,
     /// The largest error that an engine can read, on any GPU.
@@ -72,8 +71,8 @@ pub(super) struct Cost {
 impl Cost {
     /// No error at all.
     pub const NONE: Self = Self { norm: 0.0, active_norm: 0.0, max: 0.0 };
-    pub const IMPOSSIBLE: Self = Self { norm: f32::INFINITY, active_norm: f32::INFINITY, max: f32::INFINITY };
-    const UNKNOWN: Self = Self { norm: f32::NAN, active_norm: f32::NAN, max: f32::NAN };
+    pub const IMPOSSIBLE: Self = Self { norm: f64::INFINITY, active_norm: f32::INFINITY, max: f32::INFINITY };
+    const UNKNOWN: Self = Self { norm: f64::NAN, active_norm: f32::NAN, max: f32::NAN };
 }
 
 /// What a constant brick's value keeps small.
@@ -215,7 +214,7 @@ impl Trials {
         }
         // Rounded up, because a bound is what it is compared with.
         let max = if f64::from(max as f32) < max { (max as f32).next_up() } else { max as f32 };
-        Cost { norm: squares.sqrt() as f32, active_norm: active_squares.sqrt() as f32, max }
+        Cost { norm: squares.sqrt(), active_norm: active_squares.sqrt() as f32, max }
     }
 
     /// The texels of a brick in a codec that was tried on it, and their packing axis.

@@ -164,6 +164,15 @@ pub fn tree_bytes(grids: &[GridInput]) -> Result<u64, SerialiseError> {
     Ok(TreeWords::build(grids, &boxes, &nothing).words.len() as u64 * 4)
 }
 
+/// Bytes of tree, masks and texture pages: what a GPU holds.
+///
+/// # Errors
+/// [`SerialiseError::TooLarge`].
+pub fn gpu_bytes(grids: &[GridInput]) -> Result<u64, SerialiseError> {
+    let layout = relayout::place(&grids.iter().map(|g| &g.allocation).collect::<Vec<_>>());
+    Ok(tree_bytes(grids)? + layout.atlases.iter().map(|a| a.atlas.bytes()).sum::<u64>())
+}
+
 fn texel_encoding(codec: Codec, zstd: bool) -> u32 {
     match codec {
         _ if !zstd => encoding::RAW,
@@ -235,7 +244,7 @@ fn codec_norms(grid: &GridInput, outcome: &Outcome) -> [f32; Codec::WITH_TEXELS.
     let mut squares = [0.0; Codec::WITH_TEXELS.len() + 1];
     for frame in &grid.tree.frames {
         for id in grid.tree.frame_bricks(frame) {
-            squares[grid.allocation.codec(id) as usize] += f64::from(outcome.norms[id as usize]).powi(2);
+            squares[grid.allocation.codec(id) as usize] += outcome.norms[id as usize].powi(2);
         }
     }
     squares[Codec::Constant as usize] += grid.allocation.empty_squares.iter().sum::<f64>();
@@ -248,10 +257,10 @@ fn set_errors(frames: &mut [FrameRecord], grids: &[GridInput], outcomes: &[Outco
     for (grid, outcome) in grids.iter().zip(outcomes) {
         let mut empty = grid.allocation.empty_squares.iter();
         for (tree, frame) in grid.tree.frames.iter().zip(&mut frames) {
-            let square = |id: u32| f64::from(outcome.norms[id as usize]).powi(2);
+            let square = |id: u32| outcome.norms[id as usize].powi(2);
             let squares: f64 = grid.tree.frame_bricks(tree).map(square).sum();
             let squares = squares + empty.next().copied().unwrap_or(0.0);
-            frame.error_norm = (squares.sqrt() as f32).min(f32::MAX);
+            frame.error_norm = squares.sqrt();
         }
     }
 }
@@ -271,6 +280,7 @@ fn frame_tables(
                 first_chunk: lists.len() as u32,
                 chunks: slabs.len() as u32,
                 bbox: frame.stats.bbox.to_array(),
+                reserved: 0,
                 error_norm: 0.0,
                 leaves: frame.stats.leaves,
                 active_voxels: frame.stats.active_voxels,
