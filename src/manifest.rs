@@ -7,7 +7,8 @@ use serde::Deserialize;
 
 use crate::error::{Error, Result};
 use crate::settings::{
-    ByteSize, ClusterArgs, DEFAULT_ZSTD, Dedup, ErrorBound, Format, Masks, NonFinite, QualityArgs, RangeMode, Settings,
+    ByteSize, ClusterArgs, DEFAULT_ZSTD, Dedup, ErrorBound, Format, Masks, NonFinite, QualityArgs, RangeMode,
+    Settings,
 };
 
 /// The manifest's name where none is given.

@@ -17,8 +17,8 @@ use crate::stages::quantise::QuantiseError;
 use crate::stages::select::{SelectedGrid, Selection, find, select};
 use crate::stages::serialise::{FrameInput, GridInput, SerialiseError, gpu_bytes, serialise, tree_bytes};
 use crate::vdb::{GridClass, VdbFile, voxel_size};
-use crate::volume::FlatFrame;
 use crate::verify::{self, PictureSettings, Sources, VerifyReport};
+use crate::volume::FlatFrame;
 
 /// How much a finished pack is checked.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, clap::ValueEnum)]
@@ -309,7 +309,9 @@ fn allocate_all(grids: &mut [GridInput], settings: &Settings, progress: &mut dyn
         for g in 0..grids.len() {
             let tree = &mut grids[g].tree;
             let allocation = match &settings.clustering {
-                None => allocate::uniform(tree, codec, settings.range).ok_or(AllocateError::TooWide { grid: g }),
+                None => {
+                    allocate::uniform(tree, codec, settings.range).ok_or(AllocateError::TooWide { grid: g })
+                }
                 Some(clustering) => {
                     progress.stage("cluster", tree.pool.len().into(), "bricks");
                     allocate::clustered(tree, codec, settings.range, clustering).map_err(|e| e.in_grid(g))
@@ -365,7 +367,9 @@ fn allocate_error(error: AllocateError, grids: &[GridInput]) -> Error {
             "grid {:?}: its values span more than an f32 can hold: scale the grid down before the export",
             grids[grid].name
         )),
-        AllocateError::OutOfRange { grid, source } => Error::OutOfRange { grid: grids[grid].name.clone(), source },
+        AllocateError::OutOfRange { grid, source } => {
+            Error::OutOfRange { grid: grids[grid].name.clone(), source }
+        }
     }
 }
 

@@ -120,6 +120,8 @@ pub fn print_sizes(p: &PackSummary) {
     let frames = if p.frames == 1 { "frame" } else { "frames" };
     outln!("  {} {frames}, {} bricks, {} unique", count(p.frames), count(p.bricks), count(p.unique_bricks));
     for (codec, c) in &p.codecs {
+        // What has become background has no brick, but its error counts.
+        let codec = if c.bricks == 0 { "empty" } else { codec };
         outln!(
             "    {codec:9} {:>10} bricks  {:>10}  {:5.1} % of texels  {:5.1} % of error",
             count(c.bricks),

@@ -97,7 +97,9 @@ fn write_sweep(options: &Options, sweep: &Sweep, folder: &Path) -> Result<Vec<St
         })
         .collect();
     let subtitle = match (&sweep.device, options.trace) {
-        (Some(device), Some([width, height])) => format!("{}; traced by {device} at {width} × {height}", cores()),
+        (Some(device), Some([width, height])) => {
+            format!("{}; traced by {device} at {width} × {height}", cores())
+        }
         _ => cores(),
     };
     let svg = sweep_svg(&options.name, &subtitle, &sweep.points).map_err(|e| Error::Other(e.to_string()))?;
@@ -133,10 +135,20 @@ fn write_sweep(options: &Options, sweep: &Sweep, folder: &Path) -> Result<Vec<St
         .iter()
         .map(|r| {
             let p = r.point;
-            let mark = if !p.failures.is_empty() { "fails" } else if r.front_in_size { "front" } else { "" };
+            let mark = if !p.failures.is_empty() {
+                "fails"
+            } else if r.front_in_size {
+                "front"
+            } else {
+                ""
+            };
             format!(
                 "  {:20} {:40} {:>10} {:8.3} bits/voxel {:7.3} s  {mark}",
-                p.method, p.setting, psnr(p.psnr), p.bits_per_voxel, p.build_seconds
+                p.method,
+                p.setting,
+                psnr(p.psnr),
+                p.bits_per_voxel,
+                p.build_seconds
             )
         })
         .collect();
@@ -166,7 +178,11 @@ fn write_stability(options: &Options, found: &Stability, folder: &Path) -> Resul
         .spreads
         .iter()
         .map(|s| {
-            let fails = if s.failures.is_empty() { String::new() } else { format!("  fails: {}", s.failures.join("; ")) };
+            let fails = if s.failures.is_empty() {
+                String::new()
+            } else {
+                format!("  fails: {}", s.failures.join("; "))
+            };
             format!(
                 "  {:20} {:40} {:6.2} to {:6.2} dB  {:.3} to {:.3} bits/voxel{fails}",
                 s.method, s.setting, s.psnr.0, s.psnr.1, s.bits_per_voxel.0, s.bits_per_voxel.1

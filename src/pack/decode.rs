@@ -72,7 +72,9 @@ impl Pack {
             for words in &records[..words[header::RECORDS] as usize] {
                 let Some(record) = L3Record::from_words(*words) else { continue };
                 let slot = (record.codec, record.slot);
-                if record.codec != Codec::Constant && *ranges.entry(slot).or_insert(record.word2) != record.word2 {
+                if record.codec != Codec::Constant
+                    && *ranges.entry(slot).or_insert(record.word2) != record.word2
+                {
                     shared.insert(slot);
                 }
             }

@@ -5,8 +5,8 @@ use std::collections::{BTreeMap, BTreeSet, HashSet};
 use serde::Serialize;
 
 use crate::codec::Codec;
-use crate::pack::{Atlas, Pack};
 use crate::pack::tree::{MASK_WORDS, RECORD_WORDS, header};
+use crate::pack::{Atlas, Pack};
 
 /// A pack's sizes and counts.
 #[derive(Clone, Debug, Serialize)]

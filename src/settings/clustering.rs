@@ -70,9 +70,7 @@ impl ClusterArgs {
         if self.dedup != Some(Dedup::Kmeans) {
             return match clustering == default {
                 true => Ok(None),
-                false => {
-                    Err("clusters, iterations, variance and seed are for dedup = \"kmeans\"".to_owned())
-                }
+                false => Err("clusters, iterations, variance and seed are for dedup = \"kmeans\"".to_owned()),
             };
         }
         if clustering.clusters == 0 {

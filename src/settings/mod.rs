@@ -49,8 +49,7 @@ impl Format {
     }
 
     /// Every format: those of one codec, finest first, then the adaptive one.
-    pub const ALL: [Self; 6] =
-        [Self::F32, Self::F16, Self::Unorm8, Self::Bc4, Self::Bc7, Self::Adaptive];
+    pub const ALL: [Self; 6] = [Self::F32, Self::F16, Self::Unorm8, Self::Bc4, Self::Bc7, Self::Adaptive];
 }
 
 /// What the 0 and 1 of normalised texels stand for.

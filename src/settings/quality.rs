@@ -8,8 +8,8 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use super::Format;
 
-/// The PSNR of a pack for which nothing else is asked: where the pictures of nine real volumes cannot be told from
-/// those of their sources (docs/benchmarks/pictures.md).
+/// The PSNR of a pack for which nothing else is asked. The mean FLIP of nine real volumes' pictures is 0.0008 to 0.015
+/// there (docs/benchmarks/pictures.md), less than half of what bc7 costs them.
 pub const DEFAULT_PSNR: f64 = 45.0;
 
 /// How far a frame's PSNR may lie below the whole sequence's: one bright frame must not erase late, thin
@@ -101,7 +101,7 @@ impl FromStr for ErrorBound {
 
     fn from_str(text: &str) -> Result<Self, String> {
         let text = text.trim();
-        let split = text.find(|c: char| c == '%' || c == ' ' || c == 'u' || c == 'v').unwrap_or(text.len());
+        let split = text.find(['%', ' ', 'u', 'v']).unwrap_or(text.len());
         let (number, unit) = text.split_at(split);
         let (unit, scale) = match unit.trim() {
             "" => (ErrorUnit::Range, 1.0),

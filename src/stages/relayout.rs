@@ -53,9 +53,8 @@ pub fn place(allocations: &[&Allocation]) -> Layout {
         let place = |(id, coding): (usize, &Coding)| match *coding {
             Coding::Empty | Coding::Constant(_) => 0,
             Coding::Own(codec) => put(codec, TextureOf::Brick(id as u32)),
-            Coding::Shared(shape) => *shapes[shape as usize].get_or_insert_with(|| {
-                put(allocation.shapes[shape as usize].codec, TextureOf::Shape(shape))
-            }),
+            Coding::Shared(shape) => *shapes[shape as usize]
+                .get_or_insert_with(|| put(allocation.shapes[shape as usize].codec, TextureOf::Shape(shape))),
         };
         slots.push(allocation.codings.iter().enumerate().map(place).collect());
     }

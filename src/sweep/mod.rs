@@ -133,11 +133,14 @@ impl Options {
 
     /// The settings that a sweep compares.
     pub fn methods(&self) -> Vec<Method> {
-        let mut methods: Vec<Method> = (30..=70).step_by(5).map(|db| self.adaptive(Quality::Psnr(db.into()))).collect();
+        let mut methods: Vec<Method> =
+            (30..=70).step_by(5).map(|db| self.adaptive(Quality::Psnr(db.into()))).collect();
         methods.extend(
             [0.02, 0.01, 0.005, 0.001].map(|e| self.adaptive(Quality::MaxError(ErrorBound::of_range(e)))),
         );
-        methods.extend([Format::F32, Format::F16, Format::Unorm8, Format::Bc4, Format::Bc7].map(|f| self.uniform(f)));
+        methods.extend(
+            [Format::F32, Format::F16, Format::Unorm8, Format::Bc4, Format::Bc7].map(|f| self.uniform(f)),
+        );
         methods.extend([Format::Unorm8, Format::Bc4, Format::Bc7].map(|f| self.sequence_range(f)));
         methods.extend(CLUSTERINGS.map(|c| self.clustered(c, 0)));
         methods
@@ -197,5 +200,6 @@ const BLOCKY: f64 = 1.5;
 /// A word on a pack whose bricks can be seen.
 fn blocky(pack: &field::Jumps, source: &field::Jumps) -> Option<String> {
     let blockiness = pack.blockiness(source);
-    (blockiness > BLOCKY).then(|| format!("its bricks show: jumps across their faces are {blockiness:.2} times the source's"))
+    (blockiness > BLOCKY)
+        .then(|| format!("its bricks show: jumps across their faces are {blockiness:.2} times the source's"))
 }

@@ -42,7 +42,11 @@ pub fn measure(options: &Options, progress: &mut dyn Progress) -> Result<Sweep> 
             match nano_point(options, &source, (method, &setting), &quantise, scratch.path()) {
                 Ok(point) => points.push(point),
                 Err(why) => {
-                    skipped.push(Skipped { method: format!("NanoVDB {method}"), setting, why: why.to_string() });
+                    skipped.push(Skipped {
+                        method: format!("NanoVDB {method}"),
+                        setting,
+                        why: why.to_string(),
+                    });
                 }
             }
             progress.advance(1);
@@ -57,7 +61,9 @@ fn peers(peak: f64) -> Vec<(&'static str, String, Quantise)> {
         ("fp8", "8 bits".to_owned(), Quantise::Fp8),
         ("fp16", "16 bits".to_owned(), Quantise::Fp16),
     ];
-    peers.extend(FPN.map(|f| ("fpN", format!("tolerance {} %", f * 100.0), Quantise::FpN { absolute: f * peak })));
+    peers.extend(
+        FPN.map(|f| ("fpN", format!("tolerance {} %", f * 100.0), Quantise::FpN { absolute: f * peak })),
+    );
     peers
 }
 
@@ -102,7 +108,13 @@ pub(super) fn flat_frame(path: &Path, grid: &str, options: &Options) -> Result<O
     Ok(Some(flatten(&file, path, info, options.nonfinite)?.frame))
 }
 
-fn point(options: &Options, method: &Method, source: &Source, folder: &Path, gpu: Option<&Gpu>) -> Result<Point> {
+fn point(
+    options: &Options,
+    method: &Method,
+    source: &Source,
+    folder: &Path,
+    gpu: Option<&Gpu>,
+) -> Result<Point> {
     let job = options.job(method, &options.frames, folder.join("sweep.volpack"));
     let mut seconds = f64::INFINITY;
     for _ in 0..options.repeats {
@@ -266,4 +278,3 @@ pub fn difference(source: &Path, other: &Path, grid: &str) -> Result<Difference>
     );
     Ok(out)
 }
-

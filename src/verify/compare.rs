@@ -103,7 +103,9 @@ pub(super) fn compare<T: Scalar>(
     let record = &reader.grid().record;
     let peak = f64::from(record.active_max) - f64::from(record.active_min);
     let max_error = match settings.quality {
-        Quality::MaxError(bound) if settings.format == Format::Adaptive => Some(bound.absolute(peak, voxel_size)),
+        Quality::MaxError(bound) if settings.format == Format::Adaptive => {
+            Some(bound.absolute(peak, voxel_size))
+        }
         _ => None,
     };
     let is_level_set = reader.grid().record.class == GridClass::LevelSet as u32;
@@ -231,10 +233,20 @@ impl<T: Scalar> Comparison<'_, T> {
         let record = match region {
             Region::Brick(record) => record,
             Region::Background if may_be_empty => {
-                return Contract { keeps_mask: false, exact_inactive: false, has_record: true, values: Bound::Nothing };
+                return Contract {
+                    keeps_mask: false,
+                    exact_inactive: false,
+                    has_record: true,
+                    values: Bound::Nothing,
+                };
             }
             _ => {
-                return Contract { keeps_mask: true, exact_inactive: true, has_record: false, values: Bound::Exact };
+                return Contract {
+                    keeps_mask: true,
+                    exact_inactive: true,
+                    has_record: false,
+                    values: Bound::Exact,
+                };
             }
         };
         let exact_inactive = record.mask.is_some() && record.rule != InactiveRule::Texel;
@@ -314,7 +326,10 @@ impl<T: Scalar> Comparison<'_, T> {
                 && difference.abs() + f64::from(spread.as_ref().map_or(0.0, |s| s[i])) > bound
             {
                 error.fail(|| {
-                    format!("the value at {:?} is {ours}, the source has {theirs}: past max_error {bound}", at())
+                    format!(
+                        "the value at {:?} is {ours}, the source has {theirs}: past max_error {bound}",
+                        at()
+                    )
                 });
             }
         }

@@ -133,7 +133,10 @@ impl VerifyReport {
             let peak = range.map_or(0.0, |r| f64::from(r.max) - f64::from(r.min));
             let recorded = ValueRange { min: grid.record.active_min, max: grid.record.active_max };
             if range.is_some_and(|range| range != recorded) {
-                failures.push(format!("grid {:?}: the grid table's active values are not the source's", grid.name));
+                failures.push(format!(
+                    "grid {:?}: the grid table's active values are not the source's",
+                    grid.name
+                ));
             }
             let (mut active, mut all) = (Error::default(), Error::default());
             for (frame, error) in grid.frames.iter().zip(errors) {

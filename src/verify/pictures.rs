@@ -90,7 +90,7 @@ fn default_max_flip(settings: &Settings) -> f64 {
     /// The most that FLIP gives.
     const ANYTHING: f64 = 1.0;
     /// At 45 dB; six decibels less are twice the error.
-    const AT_DEFAULT_PSNR: f64 = 0.02;
+    const AT_DEFAULT_PSNR: f64 = 0.04;
     let at_psnr = |db: f64| (AT_DEFAULT_PSNR * ((DEFAULT_PSNR - db) / 6.0).exp2()).clamp(0.001, ANYTHING);
     match (settings.format, settings.quality) {
         _ if settings.clustering.is_some() => ANYTHING,

@@ -32,7 +32,9 @@ const ROWS: [(u32, u32, f64); 9] = [
 
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     let folder = tempfile::tempdir()?;
-    println!("| model | k | iterations | variance | before | after | ratio | RMSE | RMSE without | PSNR dB |");
+    println!(
+        "| model | k | iterations | variance | before | after | ratio | RMSE | RMSE without | PSNR dB |"
+    );
     println!("|---|---|---|---|---|---|---|---|---|---|");
     for sequence in &args.sequences {
         let (name, frames) = sequence::named(sequence)?;

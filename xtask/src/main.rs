@@ -91,7 +91,12 @@ fn chart(json: &Path, svg: &Path) -> Result<(), Box<dyn Error>> {
     let points: Vec<volpack::report::chart::Point> = serde_json::from_value(sweep["points"].clone())?;
     let text = |key: &str| sweep[key].as_str().unwrap_or_default().to_owned();
     let subtitle = match sweep["device"].as_str() {
-        Some(device) => format!("{}; traced by {device} at {} × {}", text("machine"), sweep["trace"][0], sweep["trace"][1]),
+        Some(device) => format!(
+            "{}; traced by {device} at {} × {}",
+            text("machine"),
+            sweep["trace"][0],
+            sweep["trace"][1]
+        ),
         None => text("machine"),
     };
     std::fs::write(svg, volpack::report::chart::sweep_svg(&text("volume"), &subtitle, &points)?)?;

@@ -44,12 +44,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             let worst = report.pictures.iter().max_by(|a, b| a.source.flip.total_cmp(&b.source.flip));
             let worst = worst.ok_or("no pictures")?.source;
             let psnr = worst.psnr.map_or("same".to_owned(), |db| format!("{db:.1} dB"));
-            println!(
-                "| {name} | {} | {:.4} | {psnr} | {:.5} |",
-                format.name(),
-                worst.flip,
-                worst.rmse
-            );
+            println!("| {name} | {} | {:.4} | {psnr} | {:.5} |", format.name(), worst.flip, worst.rmse);
         }
     }
     Ok(())

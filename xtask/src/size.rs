@@ -36,7 +36,9 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     }
     let folder = tempfile::tempdir()?;
     let mut rows = Vec::new();
-    println!("| volume | beside | its dB | ours dB | its leaves | its grid | ours | ours / leaves | ours / grid |");
+    println!(
+        "| volume | beside | its dB | ours dB | its leaves | its grid | ours | ours / leaves | ours / grid |"
+    );
     println!("|---|---|---|---|---|---|---|---|---|");
     for file in &args.files {
         let name = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();

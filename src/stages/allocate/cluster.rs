@@ -99,9 +99,13 @@ fn fraction(sequence: &SequenceRange, value: f32) -> f32 {
 
 /// A centroid as a brick of its own.
 fn texels(sequence: &SequenceRange, mode: RangeMode, centroid: &[f32]) -> Texels {
-    let value = |i: usize| (f64::from(sequence.lo) + f64::from(sequence.span) * f64::from(centroid[i])) as f32;
+    let value =
+        |i: usize| (f64::from(sequence.lo) + f64::from(sequence.span) * f64::from(centroid[i])) as f32;
     let values: [f32; BRICK_VOXELS] = std::array::from_fn(value);
-    let (min, max) = (values.iter().copied().fold(f32::INFINITY, f32::min), values.iter().copied().fold(f32::NEG_INFINITY, f32::max));
+    let (min, max) = (
+        values.iter().copied().fold(f32::INFINITY, f32::min),
+        values.iter().copied().fold(f32::NEG_INFINITY, f32::max),
+    );
     let range = match mode {
         RangeMode::Sequence => BrickRange::SEQUENCE,
         RangeMode::Brick => sequence.fit(min, max),

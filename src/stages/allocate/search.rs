@@ -51,7 +51,11 @@ const FIRST_OCTAVE: f64 = 24.0;
 const LAST_STEP: u32 = 100 * STEPS_PER_OCTAVE;
 
 fn lambda(step: u32) -> f64 {
-    if step >= LAST_STEP { 0.0 } else { (FIRST_OCTAVE - f64::from(step) / f64::from(STEPS_PER_OCTAVE)).exp2() }
+    if step >= LAST_STEP {
+        0.0
+    } else {
+        (FIRST_OCTAVE - f64::from(step) / f64::from(STEPS_PER_OCTAVE)).exp2()
+    }
 }
 
 /// An L3 record is three words.
@@ -75,8 +79,7 @@ pub fn adaptive(
     };
     let mut searches = Vec::new();
     for (i, grid) in grids.iter_mut().enumerate() {
-        let ranges =
-            Allocation::ranges(grid.tree, target.range).ok_or(AllocateError::TooWide { grid: i })?;
+        let ranges = Allocation::ranges(grid.tree, target.range).ok_or(AllocateError::TooWide { grid: i })?;
         let trials = Trials::new(grid.tree, ranges, aim, grid.sign_matters)?;
         searches.push(GridSearch::new(grid, trials));
     }
@@ -214,7 +217,8 @@ impl<'a> GridSearch<'a> {
         picks: impl Iterator<Item = (u32, Rung)>,
         advance: &mut dyn FnMut(u64),
     ) -> io::Result<bool> {
-        let unknown = picks.filter(|&(id, rung)| rung == Rung::Bc7 && self.trials.cost(id as usize, rung).is_none());
+        let unknown =
+            picks.filter(|&(id, rung)| rung == Rung::Bc7 && self.trials.cost(id as usize, rung).is_none());
         let unknown: Vec<u32> = unknown.map(|(id, _)| id).collect();
         self.trials.try_bc7(self.tree, &unknown, advance)?;
         Ok(!unknown.is_empty())
@@ -224,7 +228,8 @@ impl<'a> GridSearch<'a> {
         let (step, alone) = self.at_psnr_with_loans(psnr, floor, advance)?;
         self.find_loans(&alone, step)?;
         let (_, together) = self.at_psnr_with_loans(psnr, floor, advance)?;
-        let bits = |picks: &[Rung]| (0..).zip(picks).map(|(brick, &rung)| self.bits(brick, rung)).sum::<f64>();
+        let bits =
+            |picks: &[Rung]| (0..).zip(picks).map(|(brick, &rung)| self.bits(brick, rung)).sum::<f64>();
         if bits(&together) < bits(&alone) {
             return Ok(together);
         }
@@ -379,8 +384,7 @@ impl<'a> GridSearch<'a> {
     }
 
     fn finish(mut self, picks: &[Rung]) -> io::Result<Allocation> {
-        let mut allocation =
-            Allocation::new(self.trials.sequence, self.trials.ranges.clone(), Coding::Empty);
+        let mut allocation = Allocation::new(self.trials.sequence, self.trials.ranges.clone(), Coding::Empty);
         for (brick, &rung) in picks.iter().enumerate() {
             allocation.norms[brick] = self.cost(brick, rung).norm;
             allocation.codings[brick] = match rung {
@@ -467,14 +471,17 @@ fn at_size(
     };
     let (step, alone) = at_size_above(searches, limit, fixed, &floors, advance)?;
     let squares = |searches: &[GridSearch], picks: &[Vec<Rung>]| -> f64 {
-        let of_grid = |(s, picks): (&GridSearch, &Vec<Rung>)| s.squares(picks) / (s.peak * s.peak).max(f64::MIN_POSITIVE);
+        let of_grid = |(s, picks): (&GridSearch, &Vec<Rung>)| {
+            s.squares(picks) / (s.peak * s.peak).max(f64::MIN_POSITIVE)
+        };
         searches.iter().zip(picks).map(of_grid).sum()
     };
     for (search, picks) in searches.iter_mut().zip(&alone) {
         search.find_loans(picks, step)?;
     }
     let (_, together) = at_size_above(searches, limit, fixed, &floors, advance)?;
-    if squares(searches, &together) < squares(searches, &alone) && bytes(searches, &together, fixed) <= limit {
+    if squares(searches, &together) < squares(searches, &alone) && bytes(searches, &together, fixed) <= limit
+    {
         return Ok(together);
     }
     searches.iter_mut().for_each(GridSearch::forget_loans);
@@ -546,7 +553,8 @@ fn at_size_above(
             continue;
         }
         let fine = all(searches, too_large);
-        let mut picks = if bytes(searches, &fine, fixed) <= limit { fine.clone() } else { all(searches, fits) };
+        let mut picks =
+            if bytes(searches, &fine, fixed) <= limit { fine.clone() } else { all(searches, fits) };
         let mut order: Vec<Switch> = Vec::new();
         for (g, (search, (coarse, fine))) in searches.iter().zip(picks.iter().zip(&fine)).enumerate() {
             order.extend(switches(g, search, coarse, fine));

@@ -224,7 +224,12 @@ impl Trials {
     }
 
     /// What [`Trials::encode_kept`] makes texels of: all that has to be read, which one thread does at a time.
-    pub fn kept_or_brick(&mut self, tree: &mut SequenceTree, id: u32, codec: Codec) -> io::Result<KeptOrBrick> {
+    pub fn kept_or_brick(
+        &mut self,
+        tree: &mut SequenceTree,
+        id: u32,
+        codec: Codec,
+    ) -> io::Result<KeptOrBrick> {
         if self.kept.holds(codec) {
             let (bytes, axis) = self.kept.get(id)?;
             return Ok(KeptOrBrick::Kept(bytes, axis));
@@ -235,7 +240,13 @@ impl Trials {
     }
 
     /// A brick's texels and their packing axis.
-    pub fn encode_kept(&self, tree: &SequenceTree, id: u32, codec: Codec, kept: KeptOrBrick) -> (Vec<u8>, u8) {
+    pub fn encode_kept(
+        &self,
+        tree: &SequenceTree,
+        id: u32,
+        codec: Codec,
+        kept: KeptOrBrick,
+    ) -> (Vec<u8>, u8) {
         match kept {
             KeptOrBrick::Kept(bytes, axis) => (bytes, axis),
             KeptOrBrick::Brick(brick) => {

@@ -124,10 +124,8 @@ pub fn serialise(
 
     let mut writer = PackWriter::create(path, specs)?;
     let mut outcomes: Vec<Outcome> = grids.iter().map(|g| Outcome::before(&g.allocation)).collect();
-    let mut sources: Vec<GridBricks> = grids
-        .iter_mut()
-        .map(|g| GridBricks { tree: &mut g.tree, allocation: &mut g.allocation })
-        .collect();
+    let mut sources: Vec<GridBricks> =
+        grids.iter_mut().map(|g| GridBricks { tree: &mut g.tree, allocation: &mut g.allocation }).collect();
     for planned in &layout.atlases {
         writer.begin()?;
         let encoding = texel_encoding(planned.atlas.codec, zstd_level.is_some());
@@ -265,10 +263,7 @@ fn set_errors(frames: &mut [FrameRecord], grids: &[GridInput], outcomes: &[Outco
     }
 }
 
-fn frame_tables(
-    grids: &[GridInput],
-    slabs: &[Vec<Vec<u32>>],
-) -> (Vec<FrameRecord>, Vec<u32>) {
+fn frame_tables(grids: &[GridInput], slabs: &[Vec<Vec<u32>>]) -> (Vec<FrameRecord>, Vec<u32>) {
     let mut records = Vec::new();
     let mut lists: Vec<u32> = Vec::new();
     for (g, (grid, slabs)) in grids.iter().zip(slabs).enumerate() {
