@@ -1,13 +1,15 @@
 //! Stage 5: how each brick is coded, and what its texels' 0 and 1 stand for.
 //!
 //! A uniform format gives every brick one codec. The adaptive one tries codecs on bricks (`trial`) and gives
-//! each the one that serves the whole best (`search`), as rate-distortion theory has it: the least
+//! each the one that serves the whole best (`search`, `size`), as rate-distortion theory has it: the least
 //! D + λR, with one λ for all (Shoham & Gersho 1988).
 
+mod adaptive;
 mod cluster;
 pub mod kmeans;
 mod search;
 mod share;
+mod size;
 mod trial;
 
 use std::io;
@@ -18,8 +20,9 @@ use super::dedup::SequenceTree;
 use crate::codec::{BrickRange, Codec, OutOfRange, SequenceRange};
 use crate::settings::RangeMode;
 
+pub use adaptive::{AdaptiveGrid, Target, adaptive};
 pub use cluster::clustered;
-pub use search::{AdaptiveGrid, Target, adaptive};
+
 pub use trial::KeptTexels;
 
 /// How one grid's bricks are coded.

@@ -10,37 +10,11 @@ use std::io;
 
 use rayon::prelude::*;
 
+use super::adaptive::AdaptiveGrid;
 use super::share::{Loan, loans};
-use super::trial::{ConstantAim, Cost, Rung, Trials};
-use super::{AllocateError, Allocation, Coding, Shape};
-use crate::codec::Codec;
-use crate::pack::tree::NODE_WORDS;
-use crate::settings::{FRAME_MARGIN_DB, Quality, RangeMode};
+use super::trial::{Cost, Rung, Trials};
+use super::{Allocation, Coding, Shape};
 use crate::stages::dedup::{Payload, SequenceTree};
-use crate::stages::relayout;
-
-/// One grid to be allocated.
-pub struct AdaptiveGrid<'a> {
-    /// Its nodes and bricks.
-    pub tree: &'a mut SequenceTree,
-    /// Level sets: voxels further from the surface than this must not change sides.
-    pub sign_matters: Option<f64>,
-    /// A voxel's smallest side.
-    pub voxel_size: f64,
-}
-
-/// What a pack is asked for.
-#[derive(Clone, Copy, Debug)]
-pub struct Target {
-    /// The whole.
-    pub quality: Quality,
-    /// The PSNR that no frame falls below; 6 dB below the whole's where none is given.
-    pub min_frame_psnr: Option<f64>,
-    /// What texels are fractions of.
-    pub range: RangeMode,
-    /// Bytes of tree and masks, which no codec changes.
-    pub fixed_bytes: u64,
-}
 
 /// A step is 1.1 % of λ, under 0.05 dB of PSNR.
 const STEPS_PER_OCTAVE: u32 = 64;
@@ -59,72 +33,33 @@ fn lambda(step: u32) -> f64 {
 }
 
 /// An L3 record is three words.
-const RECORD_BITS: u32 = 96;
+pub(super) const RECORD_BITS: u32 = 96;
 
 /// Sums of squares are sums of rounded roots; a target is met with this much to spare.
 const ROUNDING: f64 = 1.0 - 1e-6;
 
-/// Gives each brick of each grid its codec. `advance` hears of bricks that BC7 was tried on.
-///
-/// # Errors
-/// [`AllocateError`].
-pub fn adaptive(
-    grids: &mut [AdaptiveGrid],
-    target: &Target,
-    advance: &mut dyn FnMut(u64),
-) -> Result<Vec<Allocation>, AllocateError> {
-    let aim = match target.quality {
-        Quality::MaxError(_) => ConstantAim::Max,
-        _ => ConstantAim::Squares,
-    };
-    let mut searches = Vec::new();
-    for (i, grid) in grids.iter_mut().enumerate() {
-        let ranges = Allocation::ranges(grid.tree, target.range).ok_or(AllocateError::TooWide { grid: i })?;
-        let trials = Trials::new(grid.tree, ranges, aim, grid.sign_matters)?;
-        searches.push(GridSearch::new(grid, trials));
-    }
-    let picks = match target.quality {
-        Quality::Psnr(db) => {
-            let floor = target.min_frame_psnr.unwrap_or(db - FRAME_MARGIN_DB);
-            searches.iter_mut().map(|s| s.at_psnr(db, floor, advance)).collect::<io::Result<_>>()?
-        }
-        Quality::MaxError(bound) => {
-            let within = |s: &mut GridSearch| s.within(bound.absolute(s.peak, s.voxel_size), advance);
-            searches.iter_mut().map(within).collect::<io::Result<_>>()?
-        }
-        Quality::BitsPerVoxel(bits) => {
-            let leaves = |s: &GridSearch| s.tree.frames.iter().map(|f| f.stats.leaves).sum::<u64>();
-            let voxels = 512 * searches.iter().map(leaves).sum::<u64>();
-            at_size(&mut searches, (bits * voxels as f64 / 8.0) as u64, target, advance)?
-        }
-        Quality::Size(bytes) => at_size(&mut searches, bytes, target, advance)?,
-    };
-    let each = searches.into_iter().zip(picks);
-    Ok(each.map(|(search, picks)| search.finish(&picks)).collect::<io::Result<_>>()?)
-}
-
 /// One grid and what is known of it.
-struct GridSearch<'a> {
-    tree: &'a mut SequenceTree,
+pub(super) struct GridSearch<'a> {
+    pub(super) tree: &'a mut SequenceTree,
     trials: Trials,
-    voxel_size: f64,
+    pub(super) voxel_size: f64,
     /// How often each brick is used over all frames.
     uses: Vec<u32>,
     /// How many L3 records each brick has: one in every run that it is in.
-    records: Vec<u32>,
+    pub(super) records: Vec<u32>,
     /// The coarsest step that each brick may have, for the sake of the frames it is in.
-    least_step: Vec<u32>,
+    pub(super) least_step: Vec<u32>,
     /// What each brick may borrow.
     loans: Vec<Option<Loan>>,
     /// The rung of bricks that lend their texels.
     lends: Vec<Option<Rung>>,
     /// Maximum less minimum of active values.
-    peak: f64,
+    pub(super) peak: f64,
     active_voxels: u64,
 }
 
 impl<'a> GridSearch<'a> {
-    fn new(grid: &'a mut AdaptiveGrid, trials: Trials) -> Self {
+    pub(super) fn new(grid: &'a mut AdaptiveGrid, trials: Trials) -> Self {
         let tree: &mut SequenceTree = grid.tree;
         let mut uses = vec![0; tree.brick_ranges.len()];
         for frame in &tree.frames {
@@ -201,18 +136,18 @@ impl<'a> GridSearch<'a> {
         cheapest.reduce(|best, next| if next.1 < best.1 { next } else { best }).expect("there are rungs").0
     }
 
-    fn picks(&self, step: u32) -> Vec<Rung> {
+    pub(super) fn picks(&self, step: u32) -> Vec<Rung> {
         (0..self.uses.len()).into_par_iter().map(|brick| self.pick(brick, step)).collect()
     }
 
     /// The squared error of all frames over active voxels, summed in the order of the bricks.
-    fn squares(&self, picks: &[Rung]) -> f64 {
+    pub(super) fn squares(&self, picks: &[Rung]) -> f64 {
         let each = picks.iter().enumerate();
         each.map(|(brick, &rung)| f64::from(self.uses[brick]) * self.active_squares(brick, rung)).sum()
     }
 
     /// Tries what was picked without having been tried. Whether there was any.
-    fn try_unknown(
+    pub(super) fn try_unknown(
         &mut self,
         picks: impl Iterator<Item = (u32, Rung)>,
         advance: &mut dyn FnMut(u64),
@@ -224,7 +159,12 @@ impl<'a> GridSearch<'a> {
         Ok(!unknown.is_empty())
     }
 
-    fn at_psnr(&mut self, psnr: f64, floor: f64, advance: &mut dyn FnMut(u64)) -> io::Result<Vec<Rung>> {
+    pub(super) fn at_psnr(
+        &mut self,
+        psnr: f64,
+        floor: f64,
+        advance: &mut dyn FnMut(u64),
+    ) -> io::Result<Vec<Rung>> {
         let (step, alone) = self.at_psnr_with_loans(psnr, floor, advance)?;
         self.find_loans(&alone, step)?;
         let (_, together) = self.at_psnr_with_loans(psnr, floor, advance)?;
@@ -273,7 +213,7 @@ impl<'a> GridSearch<'a> {
 
     /// Finds out which bricks had better borrow, were λ what it is at `step`. A brick lends or borrows, and one that
     /// lends keeps the codec it has.
-    fn find_loans(&mut self, picks: &[Rung], step: u32) -> io::Result<()> {
+    pub(super) fn find_loans(&mut self, picks: &[Rung], step: u32) -> io::Result<()> {
         let whole = |id: &u32| self.trials.is_whole(*id as usize) && picks[*id as usize] != Rung::Empty;
         let borrowers: Vec<u32> = (0..picks.len() as u32).filter(whole).collect();
         let lends = |&id: &u32| {
@@ -306,12 +246,12 @@ impl<'a> GridSearch<'a> {
         Ok(())
     }
 
-    fn forget_loans(&mut self) {
+    pub(super) fn forget_loans(&mut self) {
         self.loans.fill(None);
         self.lends.fill(None);
     }
 
-    fn within(&mut self, bound: f64, advance: &mut dyn FnMut(u64)) -> io::Result<Vec<Rung>> {
+    pub(super) fn within(&mut self, bound: f64, advance: &mut dyn FnMut(u64)) -> io::Result<Vec<Rung>> {
         loop {
             let fits = |brick, rung| f64::from(self.cost(brick, rung).max) <= bound;
             let cheapest = |brick| Rung::ALL.into_iter().find(|&r| fits(brick, r)).unwrap_or(Rung::F32);
@@ -323,12 +263,12 @@ impl<'a> GridSearch<'a> {
     }
 
     /// The PSNR of all frames together.
-    fn whole(&self, picks: &[Rung]) -> f64 {
+    pub(super) fn whole(&self, picks: &[Rung]) -> f64 {
         self.psnr(self.active_voxels, self.squares(picks))
     }
 
     /// That of the worst frame.
-    fn worst_frame(&self, picks: &[Rung]) -> f64 {
+    pub(super) fn worst_frame(&self, picks: &[Rung]) -> f64 {
         let frames = self.tree.frames.iter().map(|frame| {
             let square = |id: u32| self.active_squares(id as usize, picks[id as usize]);
             self.psnr(frame.stats.active_leaf_voxels, self.tree.frame_bricks(frame).map(square).sum())
@@ -339,7 +279,12 @@ impl<'a> GridSearch<'a> {
 
     /// Binds the bricks of every frame below `floor` to the step at which it would reach it alone. Whether
     /// there was such a frame.
-    fn raise_frames(&mut self, picks: &[Rung], floor: f64, advance: &mut dyn FnMut(u64)) -> io::Result<bool> {
+    pub(super) fn raise_frames(
+        &mut self,
+        picks: &[Rung],
+        floor: f64,
+        advance: &mut dyn FnMut(u64),
+    ) -> io::Result<bool> {
         let mut raised = false;
         for frame in 0..self.tree.frames.len() {
             let allowed = self.allowance(self.tree.frames[frame].stats.active_leaf_voxels, floor);
@@ -383,7 +328,7 @@ impl<'a> GridSearch<'a> {
         self.loans.iter_mut().filter(|loan| loan.as_ref().is_some_and(ended)).for_each(|loan| *loan = None);
     }
 
-    fn finish(mut self, picks: &[Rung]) -> io::Result<Allocation> {
+    pub(super) fn finish(mut self, picks: &[Rung]) -> io::Result<Allocation> {
         let mut allocation = Allocation::new(self.trials.sequence, self.trials.ranges.clone(), Coding::Empty);
         for (brick, &rung) in picks.iter().enumerate() {
             allocation.norms[brick] = self.cost(brick, rung).norm;
@@ -421,7 +366,7 @@ impl<'a> GridSearch<'a> {
 }
 
 /// The first step, of 0 to [`LAST_STEP`], that meets what every finer one meets too; the last if none does.
-fn first_step(meets: impl Fn(u32) -> bool) -> u32 {
+pub(super) fn first_step(meets: impl Fn(u32) -> bool) -> u32 {
     let (mut low, mut high) = (0, LAST_STEP);
     while low < high {
         let middle = (low + high) / 2;
@@ -435,16 +380,16 @@ fn first_step(meets: impl Fn(u32) -> bool) -> u32 {
 }
 
 /// One brick's move to a finer codec.
-struct Switch {
-    grid: usize,
-    brick: usize,
-    to: Rung,
+pub(super) struct Switch {
+    pub grid: usize,
+    pub brick: usize,
+    pub to: Rung,
     /// Squared peaks less for each bit more.
-    gain: f64,
+    pub gain: f64,
 }
 
 /// The bricks in which two steps of a grid differ, most gain for a bit first.
-fn switches(grid: usize, search: &GridSearch, coarse: &[Rung], fine: &[Rung]) -> Vec<Switch> {
+pub(super) fn switches(grid: usize, search: &GridSearch, coarse: &[Rung], fine: &[Rung]) -> Vec<Switch> {
     let differ = (0..coarse.len()).filter(|&brick| coarse[brick] != fine[brick]);
     let mut switches: Vec<Switch> = differ
         .map(|brick| {
@@ -455,165 +400,4 @@ fn switches(grid: usize, search: &GridSearch, coarse: &[Rung], fine: &[Rung]) ->
         .collect();
     switches.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.brick.cmp(&b.brick)));
     switches
-}
-
-/// The finest choice that takes at most `limit` bytes, with one λ for all grids; the coarsest if none does.
-fn at_size(
-    searches: &mut [GridSearch],
-    limit: u64,
-    target: &Target,
-    advance: &mut dyn FnMut(u64),
-) -> io::Result<Vec<Vec<Rung>>> {
-    let fixed = target.fixed_bytes;
-    let floors = match target.min_frame_psnr {
-        Some(floor) => vec![floor; searches.len()],
-        None => floors_at_size(searches, limit, fixed, advance)?,
-    };
-    let (step, alone) = at_size_above(searches, limit, fixed, &floors, advance)?;
-    let squares = |searches: &[GridSearch], picks: &[Vec<Rung>]| -> f64 {
-        let of_grid = |(s, picks): (&GridSearch, &Vec<Rung>)| {
-            s.squares(picks) / (s.peak * s.peak).max(f64::MIN_POSITIVE)
-        };
-        searches.iter().zip(picks).map(of_grid).sum()
-    };
-    for (search, picks) in searches.iter_mut().zip(&alone) {
-        search.find_loans(picks, step)?;
-    }
-    let (_, together) = at_size_above(searches, limit, fixed, &floors, advance)?;
-    if squares(searches, &together) < squares(searches, &alone) && bytes(searches, &together, fixed) <= limit
-    {
-        return Ok(together);
-    }
-    searches.iter_mut().for_each(GridSearch::forget_loans);
-    Ok(alone)
-}
-
-/// Halvings of the way between the frames' worst PSNR and what they would have to reach.
-const FLOOR_HALVINGS: u32 = 6;
-
-/// The floors of each grid's frames at which none is further below the whole than [`FRAME_MARGIN_DB`]. What the worst
-/// frames gain the others lose, so the whole falls as a floor rises: it is searched for between where the worst frame
-/// is without one and where it would have to be if the whole stayed.
-fn floors_at_size(
-    searches: &mut [GridSearch],
-    limit: u64,
-    fixed: u64,
-    advance: &mut dyn FnMut(u64),
-) -> io::Result<Vec<f64>> {
-    let none = vec![f64::NEG_INFINITY; searches.len()];
-    let (_, free) = at_size_above(searches, limit, fixed, &none, advance)?;
-    let ends: Vec<(f64, f64)> =
-        searches.iter().zip(&free).map(|(s, p)| (s.worst_frame(p), s.whole(p) - FRAME_MARGIN_DB)).collect();
-    if ends.iter().all(|(worst, wanted)| worst >= wanted) {
-        return Ok(none);
-    }
-    let floors = |part: f64| -> Vec<f64> {
-        let between = |&(worst, wanted): &(f64, f64)| worst + part * (wanted - worst);
-        ends.iter().map(|e| if e.0 >= e.1 { f64::NEG_INFINITY } else { between(e) }).collect()
-    };
-    let (mut low, mut high, mut best, mut best_is_even) = (0.0, 1.0, none, false);
-    for _ in 0..FLOOR_HALVINGS {
-        let middle = f64::midpoint(low, high);
-        let (_, picks) = at_size_above(searches, limit, fixed, &floors(middle), advance)?;
-        let even = |(s, p): (&GridSearch, &Vec<Rung>)| s.worst_frame(p) >= s.whole(p) - FRAME_MARGIN_DB;
-        let is_even = searches.iter().zip(&picks).all(even);
-        let fits = bytes(searches, &picks, fixed) <= limit;
-        // The lowest floor that evens frames out, or else the highest that fits.
-        if fits && (is_even || !best_is_even) {
-            (best, best_is_even) = (floors(middle), is_even);
-        }
-        if fits && !is_even { low = middle } else { high = middle }
-    }
-    Ok(best)
-}
-
-/// The finest choice that takes at most `limit` bytes and has no frame below its grid's floor, and its step. Where
-/// nothing is small enough, the coarsest.
-fn at_size_above(
-    searches: &mut [GridSearch],
-    limit: u64,
-    fixed: u64,
-    floors: &[f64],
-    advance: &mut dyn FnMut(u64),
-) -> io::Result<(u32, Vec<Vec<Rung>>)> {
-    let all = |searches: &[GridSearch], step| searches.iter().map(|s| s.picks(step)).collect::<Vec<_>>();
-    searches.iter_mut().for_each(|s| s.least_step.fill(0));
-    loop {
-        // The first step that is too large: the one before is the last that fits.
-        let too_large = first_step(|step| bytes(searches, &all(searches, step), fixed) > limit);
-        let fits = too_large.saturating_sub(1);
-        let mut unknown = false;
-        for step in [fits, too_large] {
-            for search in searches.iter_mut() {
-                let picks = search.picks(step);
-                unknown |= search.try_unknown((0..).zip(picks), advance)?;
-            }
-        }
-        if unknown {
-            continue;
-        }
-        let fine = all(searches, too_large);
-        let mut picks =
-            if bytes(searches, &fine, fixed) <= limit { fine.clone() } else { all(searches, fits) };
-        let mut order: Vec<Switch> = Vec::new();
-        for (g, (search, (coarse, fine))) in searches.iter().zip(picks.iter().zip(&fine)).enumerate() {
-            order.extend(switches(g, search, coarse, fine));
-        }
-        order.sort_by(|a, b| b.gain.total_cmp(&a.gain));
-        let (mut counts, mut saved) = (counts(&picks), saved_bytes(searches, &picks));
-        for Switch { grid, brick, to, .. } in order {
-            let from = picks[grid][brick];
-            counts[from as usize] -= 1;
-            counts[to as usize] += 1;
-            picks[grid][brick] = to;
-            if from == Rung::Empty {
-                saved = saved_bytes(searches, &picks);
-            }
-            if fixed + texel_bytes(&counts) - saved > limit {
-                picks[grid][brick] = from;
-                break;
-            }
-        }
-        let mut raised = false;
-        for ((search, picks), &floor) in searches.iter_mut().zip(&picks).zip(floors) {
-            raised |= search.raise_frames(picks, floor, advance)?;
-        }
-        if !raised {
-            return Ok((fits, picks));
-        }
-    }
-}
-
-/// What tree, masks and texels take together.
-fn bytes(searches: &[GridSearch], picks: &[Vec<Rung>], fixed: u64) -> u64 {
-    fixed + texel_bytes(&counts(picks)) - saved_bytes(searches, picks)
-}
-
-/// How many bricks each rung has.
-fn counts(picks: &[Vec<Rung>]) -> [u32; Rung::ALL.len()] {
-    let mut counts = [0; Rung::ALL.len()];
-    picks.iter().flatten().for_each(|&rung| counts[rung as usize] += 1);
-    counts
-}
-
-/// What the texture pages of that many bricks take.
-fn texel_bytes(counts: &[u32; Rung::ALL.len()]) -> u64 {
-    let bytes = |rung: Rung| relayout::plan(rung.codec(), counts[rung as usize]).bytes();
-    Rung::ALL.into_iter().filter(|rung| rung.codec() != Codec::Constant).map(bytes).sum()
-}
-
-/// What empty bricks do without: their records, and nodes of which nothing is left.
-fn saved_bytes(searches: &[GridSearch], picks: &[Vec<Rung>]) -> u64 {
-    let of_grid = |(search, picks): (&GridSearch, &Vec<Rung>)| {
-        let empty = picks.iter().zip(&search.records).filter(|(rung, _)| **rung == Rung::Empty);
-        let records: u64 = empty.map(|(_, records)| u64::from(records * RECORD_BITS / 8)).sum();
-        let tree = &*search.tree;
-        let is_empty = |&record: &u32| match tree.records[record as usize].payload {
-            Payload::Brick(id) => picks[id as usize] == Rung::Empty,
-            Payload::Constant(_) => false,
-        };
-        let nodes = tree.nodes.items().iter().filter(|node| node.entries(&tree.runs).iter().all(is_empty));
-        records + nodes.count() as u64 * NODE_WORDS as u64 * 4
-    };
-    searches.iter().zip(picks).map(of_grid).sum()
 }

@@ -1,0 +1,173 @@
+//! The best choice that fits a size, with one λ for all grids of a pack.
+
+use std::io;
+
+use super::adaptive::Target;
+use super::search::{GridSearch, RECORD_BITS, Switch, first_step, switches};
+use super::trial::Rung;
+use crate::codec::Codec;
+use crate::pack::tree::NODE_WORDS;
+use crate::settings::FRAME_MARGIN_DB;
+use crate::stages::dedup::Payload;
+use crate::stages::relayout;
+
+/// The finest choice that takes at most `limit` bytes, with one λ for all grids; the coarsest if none does.
+pub(super) fn at_size(
+    searches: &mut [GridSearch],
+    limit: u64,
+    target: &Target,
+    advance: &mut dyn FnMut(u64),
+) -> io::Result<Vec<Vec<Rung>>> {
+    let fixed = target.fixed_bytes;
+    let floors = match target.min_frame_psnr {
+        Some(floor) => vec![floor; searches.len()],
+        None => floors_at_size(searches, limit, fixed, advance)?,
+    };
+    let (step, alone) = at_size_above(searches, limit, fixed, &floors, advance)?;
+    let squares = |searches: &[GridSearch], picks: &[Vec<Rung>]| -> f64 {
+        let of_grid = |(s, picks): (&GridSearch, &Vec<Rung>)| {
+            s.squares(picks) / (s.peak * s.peak).max(f64::MIN_POSITIVE)
+        };
+        searches.iter().zip(picks).map(of_grid).sum()
+    };
+    for (search, picks) in searches.iter_mut().zip(&alone) {
+        search.find_loans(picks, step)?;
+    }
+    let (_, together) = at_size_above(searches, limit, fixed, &floors, advance)?;
+    if squares(searches, &together) < squares(searches, &alone) && bytes(searches, &together, fixed) <= limit
+    {
+        return Ok(together);
+    }
+    searches.iter_mut().for_each(GridSearch::forget_loans);
+    Ok(alone)
+}
+
+/// Halvings of the way between the frames' worst PSNR and what they would have to reach.
+const FLOOR_HALVINGS: u32 = 6;
+
+/// The floors of each grid's frames at which none is further below the whole than [`FRAME_MARGIN_DB`]. What the worst
+/// frames gain the others lose, so the whole falls as a floor rises: it is searched for between where the worst frame
+/// is without one and where it would have to be if the whole stayed.
+fn floors_at_size(
+    searches: &mut [GridSearch],
+    limit: u64,
+    fixed: u64,
+    advance: &mut dyn FnMut(u64),
+) -> io::Result<Vec<f64>> {
+    let none = vec![f64::NEG_INFINITY; searches.len()];
+    let (_, free) = at_size_above(searches, limit, fixed, &none, advance)?;
+    let ends: Vec<(f64, f64)> =
+        searches.iter().zip(&free).map(|(s, p)| (s.worst_frame(p), s.whole(p) - FRAME_MARGIN_DB)).collect();
+    if ends.iter().all(|(worst, wanted)| worst >= wanted) {
+        return Ok(none);
+    }
+    let floors = |part: f64| -> Vec<f64> {
+        let between = |&(worst, wanted): &(f64, f64)| worst + part * (wanted - worst);
+        ends.iter().map(|e| if e.0 >= e.1 { f64::NEG_INFINITY } else { between(e) }).collect()
+    };
+    let (mut low, mut high, mut best, mut best_is_even) = (0.0, 1.0, none, false);
+    for _ in 0..FLOOR_HALVINGS {
+        let middle = f64::midpoint(low, high);
+        let (_, picks) = at_size_above(searches, limit, fixed, &floors(middle), advance)?;
+        let even = |(s, p): (&GridSearch, &Vec<Rung>)| s.worst_frame(p) >= s.whole(p) - FRAME_MARGIN_DB;
+        let is_even = searches.iter().zip(&picks).all(even);
+        let fits = bytes(searches, &picks, fixed) <= limit;
+        // The lowest floor that evens frames out, or else the highest that fits.
+        if fits && (is_even || !best_is_even) {
+            (best, best_is_even) = (floors(middle), is_even);
+        }
+        if fits && !is_even { low = middle } else { high = middle }
+    }
+    Ok(best)
+}
+
+/// The finest choice that takes at most `limit` bytes and has no frame below its grid's floor, and its step. Where
+/// nothing is small enough, the coarsest.
+fn at_size_above(
+    searches: &mut [GridSearch],
+    limit: u64,
+    fixed: u64,
+    floors: &[f64],
+    advance: &mut dyn FnMut(u64),
+) -> io::Result<(u32, Vec<Vec<Rung>>)> {
+    let all = |searches: &[GridSearch], step| searches.iter().map(|s| s.picks(step)).collect::<Vec<_>>();
+    searches.iter_mut().for_each(|s| s.least_step.fill(0));
+    loop {
+        // The first step that is too large: the one before is the last that fits.
+        let too_large = first_step(|step| bytes(searches, &all(searches, step), fixed) > limit);
+        let fits = too_large.saturating_sub(1);
+        let mut unknown = false;
+        for step in [fits, too_large] {
+            for search in searches.iter_mut() {
+                let picks = search.picks(step);
+                unknown |= search.try_unknown((0..).zip(picks), advance)?;
+            }
+        }
+        if unknown {
+            continue;
+        }
+        let fine = all(searches, too_large);
+        let mut picks =
+            if bytes(searches, &fine, fixed) <= limit { fine.clone() } else { all(searches, fits) };
+        let mut order: Vec<Switch> = Vec::new();
+        for (g, (search, (coarse, fine))) in searches.iter().zip(picks.iter().zip(&fine)).enumerate() {
+            order.extend(switches(g, search, coarse, fine));
+        }
+        order.sort_by(|a, b| b.gain.total_cmp(&a.gain));
+        let (mut counts, mut saved) = (counts(&picks), saved_bytes(searches, &picks));
+        for Switch { grid, brick, to, .. } in order {
+            let from = picks[grid][brick];
+            counts[from as usize] -= 1;
+            counts[to as usize] += 1;
+            picks[grid][brick] = to;
+            if from == Rung::Empty {
+                saved = saved_bytes(searches, &picks);
+            }
+            if fixed + texel_bytes(&counts) - saved > limit {
+                picks[grid][brick] = from;
+                break;
+            }
+        }
+        let mut raised = false;
+        for ((search, picks), &floor) in searches.iter_mut().zip(&picks).zip(floors) {
+            raised |= search.raise_frames(picks, floor, advance)?;
+        }
+        if !raised {
+            return Ok((fits, picks));
+        }
+    }
+}
+
+/// What tree, masks and texels take together.
+fn bytes(searches: &[GridSearch], picks: &[Vec<Rung>], fixed: u64) -> u64 {
+    fixed + texel_bytes(&counts(picks)) - saved_bytes(searches, picks)
+}
+
+/// How many bricks each rung has.
+fn counts(picks: &[Vec<Rung>]) -> [u32; Rung::ALL.len()] {
+    let mut counts = [0; Rung::ALL.len()];
+    picks.iter().flatten().for_each(|&rung| counts[rung as usize] += 1);
+    counts
+}
+
+/// What the texture pages of that many bricks take.
+fn texel_bytes(counts: &[u32; Rung::ALL.len()]) -> u64 {
+    let bytes = |rung: Rung| relayout::plan(rung.codec(), counts[rung as usize]).bytes();
+    Rung::ALL.into_iter().filter(|rung| rung.codec() != Codec::Constant).map(bytes).sum()
+}
+
+/// What empty bricks do without: their records, and nodes of which nothing is left.
+fn saved_bytes(searches: &[GridSearch], picks: &[Vec<Rung>]) -> u64 {
+    let of_grid = |(search, picks): (&GridSearch, &Vec<Rung>)| {
+        let empty = picks.iter().zip(&search.records).filter(|(rung, _)| **rung == Rung::Empty);
+        let records: u64 = empty.map(|(_, records)| u64::from(records * RECORD_BITS / 8)).sum();
+        let tree = &*search.tree;
+        let is_empty = |&record: &u32| match tree.records[record as usize].payload {
+            Payload::Brick(id) => picks[id as usize] == Rung::Empty,
+            Payload::Constant(_) => false,
+        };
+        let nodes = tree.nodes.items().iter().filter(|node| node.entries(&tree.runs).iter().all(is_empty));
+        records + nodes.count() as u64 * NODE_WORDS as u64 * 4
+    };
+    searches.iter().zip(picks).map(of_grid).sum()
+}
