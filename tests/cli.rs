@@ -312,3 +312,37 @@ fn a_slip_in_the_arguments_costs_no_file() {
     }
     assert!(at.join("b.volpack").exists(), "the asset after a bad one is built");
 }
+
+#[test]
+fn init_writes_a_manifest_that_builds() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    std::fs::create_dir_all(at.join("shots/[a]")).unwrap();
+    for (from, to) in [
+        ("anim_0001", "shots/[a]/puff_9"),
+        ("anim_0002", "shots/[a]/puff_10"),
+        ("fog_half_blosc", "shots/[a]/puff_low_10"),
+        ("levelset_half", "ball"),
+        ("frustum", "odd"),
+    ] {
+        std::fs::copy(fixture(&format!("{from}.vdb")), at.join(format!("{to}.vdb"))).unwrap();
+    }
+    std::fs::write(at.join("broken_1.vdb"), b"no volume").unwrap();
+    let output = volpack(at, &["init"]);
+    let text = stdout(&output);
+    assert!(text.contains("puff: 2 files: density (float), temperature (float)"), "{text}");
+    assert!(String::from_utf8_lossy(&output.stderr).contains("left out: ./broken_1.vdb"));
+
+    let manifest = volpack::manifest::Manifest::read(&at.join("pipeline.toml")).unwrap();
+    let files =
+        |asset: &str| volpack::manifest::expand(&manifest.asset(asset).unwrap().frames).unwrap().len();
+    assert_eq!([files("puff"), files("puff_low"), files("ball"), files("odd")], [2, 1, 1, 1]);
+    stdout(&volpack(at, &["build", "--asset", "puff", "--asset", "ball", "--verify", "voxels"]));
+    assert!(at.join("packs/puff.volpack").exists() && at.join("packs/ball.volpack").exists());
+
+    // What someone wrote is not written over.
+    let (code, error) = failure(&volpack(at, &["init"]));
+    assert!(code == 2 && error.contains("exists"), "{code} {error}");
+    let (code, error) = failure(&volpack(at, &["init", "packs"]));
+    assert!(code == 3 && error.contains("no .vdb file"), "{code} {error}");
+}

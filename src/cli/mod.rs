@@ -1,6 +1,7 @@
 //! The command line: one file a subcommand.
 
 mod build;
+mod init;
 mod inspect;
 mod progress;
 mod render;
@@ -58,6 +59,8 @@ struct Common {
 enum Command {
     /// Build packs from a manifest, or one pack from files
     Build(build::BuildArgs),
+    /// Find the sequences in a folder and write a manifest for them
+    Init(init::InitArgs),
     /// Say what is in a .vdb or a .volpack
     Inspect(inspect::InspectArgs),
     /// Prove a pack against its source
@@ -187,6 +190,7 @@ pub fn run(cli: Cli) -> Result<()> {
     }
     match cli.command {
         Command::Build(args) => build::run(&args, cli.common),
+        Command::Init(args) => init::run(&args, cli.common),
         Command::Inspect(args) => inspect::run(&args),
         Command::Verify(args) => verify::run(&args, cli.common),
         Command::Render(args) => render::run(&args, cli.common),

@@ -53,7 +53,8 @@ pub fn run(args: &SweepArgs, common: Common) -> Result<()> {
     std::fs::create_dir_all(&args.output).map_err(Error::io(&args.output))?;
     let mut reporter = Reporter::new(&options.name, common.quiet);
     let result = if args.stability {
-        stability(&options, &mut reporter).and_then(|found| write_stability(&options, &found, &args.output))
+        let found = stability(&options, &options.repeated_methods(), &mut reporter);
+        found.and_then(|found| write_stability(&options, &found, &args.output))
     } else {
         measure(&options, &mut reporter).and_then(|found| write_sweep(&options, &found, &args.output))
     };

@@ -111,7 +111,8 @@ impl Options {
         Method { method: format.name(), setting: "sequence range".to_owned(), settings }
     }
 
-    fn adaptive(&self, quality: Quality) -> Method {
+    /// Adaptive packs of a quality.
+    pub fn adaptive(&self, quality: Quality) -> Method {
         let settings = Settings { quality, ..self.settings(Format::Adaptive) };
         let (method, setting) = match quality {
             Quality::Psnr(db) => ("adaptive", format!("psnr = {db}")),
@@ -144,6 +145,24 @@ impl Options {
         methods.extend([Format::Unorm8, Format::Bc4, Format::Bc7].map(|f| self.sequence_range(f)));
         methods.extend(CLUSTERINGS.map(|c| self.clustered(c, 0)));
         methods
+    }
+
+    /// The settings that a sweep of stability repeats.
+    pub fn repeated_methods(&self) -> Vec<Method> {
+        vec![
+            self.adaptive(Quality::Psnr(35.0)),
+            self.adaptive(Quality::default()),
+            self.adaptive(Quality::Psnr(55.0)),
+            self.adaptive(Quality::MaxError(ErrorBound::of_range(0.01))),
+            self.uniform(Format::Unorm8),
+            self.sequence_range(Format::Unorm8),
+            self.uniform(Format::Bc4),
+            self.uniform(Format::Bc7),
+            self.clustered((100, 5, 0.01), 0),
+            self.clustered((1000, 5, 0.1), 0),
+            self.clustered((100, 5, 0.1), 0),
+            self.clustered((100, 5, 0.99), 0),
+        ]
     }
 
     fn job(&self, method: &Method, frames: &[PathBuf], output: PathBuf) -> Job {

@@ -11,7 +11,7 @@ use crate::pack::Pack;
 use crate::pipeline::{Progress, Silent, build_altered};
 use crate::report::PackSummary;
 use crate::report::chart::Spread;
-use crate::settings::{Clustering, ErrorBound, Format, Quality, Settings};
+use crate::settings::{Clustering, Format, Quality, Settings};
 use crate::volume::ValueRange;
 
 /// PSNR that differs by more from one repetition to another is a method that fails.
@@ -58,27 +58,13 @@ fn variations(options: &Options, method: &Method) -> Vec<Variation> {
     out
 }
 
-/// Repeats the methods that charts compare.
+/// Repeats each method.
 ///
 /// # Errors
 /// When a source cannot be read or packed.
-pub fn stability(options: &Options, progress: &mut dyn Progress) -> Result<Stability> {
+pub fn stability(options: &Options, methods: &[Method], progress: &mut dyn Progress) -> Result<Stability> {
     let scratch = tempfile::tempdir().map_err(Error::io(std::env::temp_dir()))?;
-    let methods = [
-        options.adaptive(Quality::Psnr(35.0)),
-        options.adaptive(Quality::default()),
-        options.adaptive(Quality::Psnr(55.0)),
-        options.adaptive(Quality::MaxError(ErrorBound::of_range(0.01))),
-        options.uniform(Format::Unorm8),
-        options.sequence_range(Format::Unorm8),
-        options.uniform(Format::Bc4),
-        options.uniform(Format::Bc7),
-        options.clustered((100, 5, 0.01), 0),
-        options.clustered((1000, 5, 0.1), 0),
-        options.clustered((100, 5, 0.1), 0),
-        options.clustered((100, 5, 0.99), 0),
-    ];
-    let (spreads, skipped) = each(&methods, progress, |method| spread(options, method, scratch.path()))?;
+    let (spreads, skipped) = each(methods, progress, |method| spread(options, method, scratch.path()))?;
     Ok(Stability { spreads, skipped })
 }
 
