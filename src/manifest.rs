@@ -153,7 +153,7 @@ impl RawAsset {
         };
         let in_asset = |e: String| format!("asset {name:?}: {e}");
         let quality = adaptive.quality(self.format).map_err(in_asset)?;
-        let clustering = clusters.clustering().map_err(in_asset)?;
+        let clustering = clusters.clustering(self.format).map_err(in_asset)?;
         let frames = match self.frames {
             OneOrMany::One(one) => vec![one],
             OneOrMany::Many(many) => many,

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use crate::error::{Error, Result};
 use crate::pack::{Pack, Provenance, Source};
 use crate::report::PackSummary;
-use crate::settings::{Format, Masks, Quality, Settings};
+use crate::settings::{Format, Masks, NOT_WITH_ADAPTIVE, Quality, Settings};
 use crate::stages::allocate::{self, AdaptiveGrid, AllocateError, Allocation, Target};
 use crate::stages::dedup::{DedupError, MaskPolicy, SequenceTree};
 use crate::stages::flatten::{Flattened, flatten};
@@ -102,6 +102,9 @@ pub fn build_altered(
     progress: &mut dyn Progress,
 ) -> Result<Outcome> {
     check_output(job)?;
+    if job.settings.format == Format::Adaptive && job.settings.clustering.is_some() {
+        return Err(Error::Usage(NOT_WITH_ADAPTIVE.to_owned()));
+    }
     let mut clock = Clock::new();
     progress.stage("metadata", job.frames.len() as u64, "files");
     let sequence = metadata::read(&job.frames)?;
@@ -321,13 +324,6 @@ fn allocate_all(grids: &mut [GridInput], settings: &Settings, progress: &mut dyn
         }
         return Ok(());
     }
-    if settings.clustering.is_some() {
-        return Err(Error::Usage(
-            "clustering by k-means goes with one codec for all bricks, such as format = \"bc7\": \
-             the adaptive format promises a quality that clusters know nothing of"
-                .to_owned(),
-        ));
-    }
     let target = Target {
         quality: settings.quality,
         min_frame_psnr: settings.min_frame_psnr,
@@ -346,7 +342,7 @@ fn allocate_all(grids: &mut [GridInput], settings: &Settings, progress: &mut dyn
 /// A size that the coarsest choice does not meet is an error that names the least.
 fn check_size(grids: &[GridInput], quality: Quality) -> Result<()> {
     let leaves: u64 = grids.iter().flat_map(|g| &g.tree.frames).map(|f| f.stats.leaves).sum();
-    let bits_of = |bytes: u64| bytes as f64 / (64.0 * leaves as f64);
+    let bits_of = |bytes: u64| if leaves == 0 { 0.0 } else { bytes as f64 / (64.0 * leaves as f64) };
     let bytes = gpu_bytes(grids).map_err(|e| Error::Unsupported(e.to_string()))?;
     match quality {
         Quality::Size(asked) if bytes > asked => Err(Error::Usage(format!(

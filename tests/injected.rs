@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use common::{build_verified, fixture};
 use reseal::reseal;
 use volpack::codec::Codec;
-use volpack::pack::layout::{Header, Section, kind};
+use volpack::pack::layout::{FrameRecord, Header, Section, kind};
 use volpack::pack::tree::{NODE_WORDS, RECORD_WORDS, header};
 use volpack::pack::{Pack, Region};
 use volpack::settings::{Format, Settings};
@@ -153,4 +153,17 @@ fn wrong_inactive_rules_and_masks_are_found() {
         words[at] = 0.25f32.to_bits();
     });
     assert!(background.unwrap().contains("background"), "a wrong background");
+}
+
+#[test]
+fn an_error_norm_that_is_no_number_passes_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let victim = Victim::new("fog_half_zip.vdb", "density", Format::Bc7, folder.path());
+    for norm in [f64::NAN, f64::INFINITY, 0.0] {
+        let found = victim.verdict(|bytes| {
+            let at = Victim::section(bytes, kind::FRAMES) + std::mem::offset_of!(FrameRecord, error_norm);
+            bytes[at..at + 8].copy_from_slice(&norm.to_le_bytes());
+        });
+        assert!(found.is_some_and(|found| found.contains("the encoder left")), "{norm}");
+    }
 }

@@ -116,7 +116,7 @@ impl SettingsArgs {
             format,
             quality: self.quality.quality(format).map_err(Error::Usage)?,
             min_frame_psnr: self.quality.min_frame_psnr,
-            clustering: self.clusters.clustering().map_err(Error::Usage)?,
+            clustering: self.clusters.clustering(format).map_err(Error::Usage)?,
             range: self.range.unwrap_or_default(),
             masks: self.masks.unwrap_or_default(),
             nonfinite: self.nonfinite.unwrap_or_default(),

@@ -24,7 +24,7 @@ pub struct SweepArgs {
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
     /// Repeat each method with other seeds, frame orders, thread counts and noise: stability.csv, .json and .svg
-    #[arg(long)]
+    #[arg(long, conflicts_with_all = ["repeats", "trace"])]
     stability: bool,
     /// The grid [default: density, else the only scalar grid]
     #[arg(short, long, value_name = "NAME")]
@@ -158,8 +158,8 @@ fn write_sweep(options: &Options, sweep: &Sweep, folder: &Path) -> Result<Vec<St
 }
 
 fn write_stability(options: &Options, found: &Stability, folder: &Path) -> Result<Vec<String>> {
-    let svg =
-        stability_svg(&options.name, &cores(), &found.spreads).map_err(|e| Error::Other(e.to_string()))?;
+    let svg = stability_svg(&options.name, "On 1, 2 and 3 threads", &found.spreads)
+        .map_err(|e| Error::Other(e.to_string()))?;
     write(&folder.join("stability.svg"), svg.as_bytes())?;
     let json = json!({ "volpack": env!("CARGO_PKG_VERSION"), "volume": options.name, "frames": options.frames.len(),
         "spreads": found.spreads, "skipped": found.skipped });

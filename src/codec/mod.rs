@@ -191,9 +191,9 @@ pub fn decode(
     out
 }
 
-/// How far a GPU's arithmetic may be from [`decode`]'s, of the largest number in it: `lo + span · (m + e · t)` is
-/// four roundings of 2⁻²⁴, and as many again where a compiler contracts it otherwise.
-const ARITHMETIC: f32 = 8.0 / (1 << 24) as f32;
+/// How far a GPU's arithmetic may be from [`decode`]'s, of the largest number in it, `lo + span · (m/65535 + e · t)`: four
+/// roundings of 2⁻²⁴ here, there as many and a division that WGSL allows 2.5 units in the last place (5 · 2⁻²⁴).
+const ARITHMETIC: f32 = 16.0 / (1 << 24) as f32;
 
 /// For each voxel, how far what a GPU reads may be from what [`decode`] gives, in the grid's units.
 pub fn spread(

@@ -3,6 +3,8 @@
 use clap::{Args, ValueEnum};
 use serde::{Deserialize, Serialize};
 
+use super::Format;
+
 /// Which bricks are one.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]
@@ -34,6 +36,10 @@ impl Default for Clustering {
     }
 }
 
+/// Why an adaptive pack cannot be clustered.
+pub const NOT_WITH_ADAPTIVE: &str = "dedup = \"kmeans\" goes with one codec for all bricks, such as format = \"bc7\": \
+    the adaptive format promises a quality that clusters know nothing of";
+
 /// The settings that make a [`Clustering`].
 #[derive(Args, Clone, Debug, Default, PartialEq)]
 pub struct ClusterArgs {
@@ -58,8 +64,8 @@ impl ClusterArgs {
     /// How similar bricks are clustered; `None` for not at all.
     ///
     /// # Errors
-    /// When a number makes no sense, or k-means is given settings without being asked for.
-    pub fn clustering(&self) -> Result<Option<Clustering>, String> {
+    /// When a number makes no sense, k-means is given settings without being asked for, or the format is adaptive.
+    pub fn clustering(&self, format: Format) -> Result<Option<Clustering>, String> {
         let default = Clustering::default();
         let clustering = Clustering {
             clusters: self.clusters.unwrap_or(default.clusters),
@@ -68,10 +74,14 @@ impl ClusterArgs {
             seed: self.seed.unwrap_or(default.seed),
         };
         if self.dedup != Some(Dedup::Kmeans) {
-            return match clustering == default {
-                true => Ok(None),
-                false => Err("clusters, iterations, variance and seed are for dedup = \"kmeans\"".to_owned()),
+            let given = self.clusters.is_some() || self.iterations.is_some();
+            return match given || self.variance.is_some() || self.seed.is_some() {
+                false => Ok(None),
+                true => Err("clusters, iterations, variance and seed are for dedup = \"kmeans\"".to_owned()),
             };
+        }
+        if format == Format::Adaptive {
+            return Err(NOT_WITH_ADAPTIVE.to_owned());
         }
         if clustering.clusters == 0 {
             return Err("clusters is a number above 0".to_owned());

@@ -6,7 +6,7 @@ mod quality;
 use clap::ValueEnum;
 use serde::{Deserialize, Serialize};
 
-pub use clustering::{ClusterArgs, Clustering, Dedup};
+pub use clustering::{ClusterArgs, Clustering, Dedup, NOT_WITH_ADAPTIVE};
 pub use quality::{ByteSize, DEFAULT_PSNR, ErrorBound, FRAME_MARGIN_DB, Quality, QualityArgs};
 
 use crate::codec::Codec;

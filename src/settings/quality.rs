@@ -198,10 +198,15 @@ impl QualityArgs {
                 format.name()
             ));
         }
-        for db in [self.psnr, self.min_frame_psnr].into_iter().flatten() {
-            decibels(&db.to_string())?;
+        for (key, db) in [("psnr", self.psnr), ("min_frame_psnr", self.min_frame_psnr)] {
+            db.map_or(Ok(0.0), |db| decibels(&db.to_string())).map_err(|e| format!("{key}: {e}"))?;
         }
-        self.bits_per_voxel.map_or(Ok(0.0), |bits| above_zero(&bits.to_string()))?;
+        let bits = self.bits_per_voxel.map_or(Ok(0.0), |bits| above_zero(&bits.to_string()));
+        bits.map_err(|e| format!("bits_per_voxel: {e}"))?;
+        if self.max_error.is_some() && self.min_frame_psnr.is_some() {
+            return Err("max_error holds for every voxel of every frame: min_frame_psnr does not go with it"
+                .to_owned());
+        }
         let asked = [
             self.psnr.map(Quality::Psnr),
             self.max_error.map(Quality::MaxError),

@@ -44,18 +44,9 @@ pub enum Quantise {
     /// Per leaf the fewest of 1, 2, 4, 8 or 16 bits that keep every value, inactive ones too, within a tolerance
     /// (`-a`; `AbsDiff` in `util/GridBuilder.h`). 16 bits are taken unchecked.
     FpN {
-        /// Greatest error of a value, in the grid's own unit. If negative, the same as `FpNDefault`.
+        /// Greatest error of a value, in the grid's own unit.
         absolute: f64,
     },
-    /// As `FpN`, with the error over the greater of the exact and the decoded value (`-r`; `RelDiff`). Of little
-    /// use for a fog: 0 decoded as 0 is 0/0, which passes no tolerance, so a leaf with a 0 gets 16 bits.
-    FpNRelative {
-        /// Greatest error of a value, as a fraction of it.
-        relative: f64,
-    },
-    /// `FpN` with the tool's own tolerance (`OpenToNanoVDB::compression`): 0.01 for a fog, a tenth of a voxel for
-    /// a level set, 0 for any other class of grid.
-    FpNDefault,
 }
 
 impl Quantise {
@@ -68,8 +59,6 @@ impl Quantise {
             Quantise::Fp16 => ("--fp16".into(), 15, Some(16)),
             // The tolerance has to be an argument of its own: `-a0.01` is refused.
             Quantise::FpN { absolute } => (format!("--fpN -a {absolute}"), 16, None),
-            Quantise::FpNRelative { relative } => (format!("--fpN -r {relative}"), 16, None),
-            Quantise::FpNDefault => ("--fpN".into(), 16, None),
         }
     }
 }
@@ -254,7 +243,7 @@ mod tests {
     use super::*;
     use std::io::Cursor;
 
-    const FPN: Quantise = Quantise::FpNDefault;
+    const FPN: Quantise = Quantise::FpN { absolute: 0.01 };
     /// Where the grid begins: header, metadata and "density" with its zero.
     const GRID: usize = 16 + 176 + 8;
     /// Where the leaves begin, with 64 bytes in place of root and internal nodes.

@@ -12,6 +12,8 @@ use crate::pipeline::{Progress, Silent, build_altered};
 use crate::report::PackSummary;
 use crate::report::chart::Spread;
 use crate::settings::{Clustering, Format, Quality, Settings};
+use crate::stages::metadata;
+use crate::stages::select::select;
 use crate::volume::ValueRange;
 
 /// PSNR that differs by more from one repetition to another is a method that fails.
@@ -64,6 +66,8 @@ fn variations(options: &Options, method: &Method) -> Vec<Variation> {
 /// When a source cannot be read or packed.
 pub fn stability(options: &Options, methods: &[Method], progress: &mut dyn Progress) -> Result<Stability> {
     let scratch = tempfile::tempdir().map_err(Error::io(std::env::temp_dir()))?;
+    // A grid that is not there is an error of the whole, not of each method.
+    select(&metadata::read(&options.frames)?, &options.grid.iter().cloned().collect::<Vec<_>>())?;
     let (spreads, skipped) = each(methods, progress, |method| spread(options, method, scratch.path()))?;
     Ok(Stability { spreads, skipped })
 }
@@ -79,8 +83,8 @@ fn spread(options: &Options, method: &Method, folder: &Path) -> Result<Spread> {
     };
     let blockiness = |run: &Run| run.jumps[1].blockiness(&run.jumps[0]);
     let mut failures = Vec::new();
-    let same = |run: &&Run| matches!(run.variation, Variation::Threads(_)) && run.digest != runs[0].digest;
-    if runs.iter().any(|run| same(&run)) {
+    let differs = |run: &&Run| matches!(run.variation, Variation::Threads(_)) && run.digest != runs[0].digest;
+    if runs.iter().any(|run| differs(&run)) {
         failures.push("its bytes depend on the number of threads".to_owned());
     }
     let psnr = range(&|run| run.psnr);

@@ -104,24 +104,41 @@ fn worse(a: Metrics, b: Metrics) -> Metrics {
 /// PSNR is summed in another order here than when bricks were allocated.
 const PSNR_TOLERANCE_DB: f64 = 1e-3;
 
-/// What an adaptive pack promised of its grids and frames and does not keep. The largest error is checked voxel by
-/// voxel.
+/// What an adaptive pack promised of its grids, frames and size and does not keep. The largest error is checked voxel
+/// by voxel.
 fn broken_promises(pack: &Pack, grids: &[GridReport], frames: &[FrameReport]) -> Vec<String> {
     let settings = &pack.provenance.settings;
-    let Quality::Psnr(asked) = settings.quality else { return Vec::new() };
     if settings.format != Format::Adaptive {
         return Vec::new();
     }
     let below = |metrics: &Metrics, asked: f64| metrics.psnr.filter(|db| *db < asked - PSNR_TOLERANCE_DB);
-    let of_grids = grids.iter().filter_map(|g| {
-        below(&g.active, asked).map(|db| format!("grid {:?}: {db:.3} dB, {asked} were promised", g.grid))
-    });
-    let floor = settings.min_frame_psnr.unwrap_or(asked - FRAME_MARGIN_DB);
-    let of_frames = frames.iter().filter_map(|f| {
-        let db = below(&f.active, floor)?;
-        Some(format!("grid {:?} frame {}: {db:.3} dB, at least {floor} were promised", f.grid, f.frame))
-    });
-    of_grids.chain(of_frames).collect()
+    let mut broken = Vec::new();
+    let mut floor = settings.min_frame_psnr;
+    if let Quality::Psnr(asked) = settings.quality {
+        floor = floor.or(Some(asked - FRAME_MARGIN_DB));
+        broken.extend(grids.iter().filter_map(|g| {
+            below(&g.active, asked).map(|db| format!("grid {:?}: {db:.3} dB, {asked} were promised", g.grid))
+        }));
+    }
+    broken.extend(frames.iter().filter_map(|f| {
+        let db = below(&f.active, floor?)?;
+        Some(format!("grid {:?} frame {}: {db:.3} dB, at least {} were promised", f.grid, f.frame, floor?))
+    }));
+    let bytes = pack.tree.len() as u64 * 4 + pack.atlases.iter().map(|a| a.bytes()).sum::<u64>();
+    let leaves =
+        pack.grids.iter().flat_map(|g| &g.frames).map(|f| f.record.leaves).fold(0, u64::saturating_add);
+    match settings.quality {
+        Quality::Size(asked) if bytes > asked => {
+            broken.push(format!("{bytes} bytes on the GPU, at most {asked} were promised"));
+        }
+        Quality::BitsPerVoxel(asked) if bytes as f64 > asked * 64.0 * leaves as f64 && leaves > 0 => {
+            broken.push(format!(
+                "{bytes} bytes on the GPU are more than the {asked} bits a voxel that were promised"
+            ));
+        }
+        _ => {}
+    }
+    broken
 }
 
 impl VerifyReport {

@@ -28,7 +28,7 @@ pub struct Target {
     pub min_frame_psnr: Option<f64>,
     /// What texels are fractions of.
     pub range: RangeMode,
-    /// Bytes of tree and masks, which no codec changes.
+    /// Bytes of tree and masks with a record for every brick.
     pub fixed_bytes: u64,
 }
 

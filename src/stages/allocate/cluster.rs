@@ -68,6 +68,16 @@ pub fn clustered(
         .map(|(shape, texels)| decode(codec, &shape.bytes, shape.axis, &sequence, texels.range))
         .collect();
 
+    // Texels that are fractions are read by the range that they were made with; what bounds raw ones is what they
+    // decode to.
+    let ranges: Vec<BrickRange> = decoded
+        .iter()
+        .zip(&centroids)
+        .map(
+            |(values, texels)| if codec.is_normalised() { texels.range } else { fit(&sequence, &values[..]) },
+        )
+        .collect();
+
     let rules = tree.brick_rules();
     for (ids, members) in ids.chunks(BRICKS_IN_FLIGHT).zip(found.members.chunks(BRICKS_IN_FLIGHT)) {
         bricks.clear();
@@ -77,7 +87,7 @@ pub fn clustered(
             let square = |i: usize| (f64::from(values[i]) - f64::from(brick.values[i])).powi(2);
             allocation.norms[id] = carried(brick, rules[id]).ones().map(square).sum::<f64>().sqrt();
             allocation.codings[id] = Coding::Shared(member);
-            allocation.ranges[id] = centroids[member as usize].range;
+            allocation.ranges[id] = ranges[member as usize];
         }
     }
     Ok(allocation)
@@ -102,13 +112,16 @@ fn texels(sequence: &SequenceRange, mode: RangeMode, centroid: &[f32]) -> Texels
     let value =
         |i: usize| (f64::from(sequence.lo) + f64::from(sequence.span) * f64::from(centroid[i])) as f32;
     let values: [f32; BRICK_VOXELS] = std::array::from_fn(value);
-    let (min, max) = (
-        values.iter().copied().fold(f32::INFINITY, f32::min),
-        values.iter().copied().fold(f32::NEG_INFINITY, f32::max),
-    );
     let range = match mode {
         RangeMode::Sequence => BrickRange::SEQUENCE,
-        RangeMode::Brick => sequence.fit(min, max),
+        RangeMode::Brick => fit(sequence, &values),
     };
     Texels { values, carried: Mask512::ALL, range }
+}
+
+/// The tightest range around some values.
+fn fit(sequence: &SequenceRange, values: &[f32]) -> BrickRange {
+    let (min, max) =
+        values.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(a, b), v| (a.min(*v), b.max(*v)));
+    sequence.fit(min, max)
 }

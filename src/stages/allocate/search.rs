@@ -18,10 +18,10 @@ use crate::stages::dedup::{Payload, SequenceTree};
 
 /// A step is 1.1 % of λ, under 0.05 dB of PSNR.
 const STEPS_PER_OCTAVE: u32 = 64;
-/// λ of step 0, in squared peaks a bit: 2^24 times 1,024 bits outweigh the greatest error of a brick (512 squared
-/// peaks) in every frame of the longest sequence.
+/// λ near step 0, in squared peaks a bit: 2^24 times 1,024 bits outweigh the greatest error of a fog's brick (512 squared
+/// peaks) in every frame of the longest sequence. Step 0 itself is the coarsest choice whatever its error.
 const FIRST_OCTAVE: f64 = 24.0;
-/// The last step with a λ above 0 has 2^-76: 16 bits of error a brick weigh more there than one texel bit, past 200 dB.
+/// From this step on λ is 0. The one before has 2^-76: a bit is worth less there than an error past 200 dB.
 const LAST_STEP: u32 = 100 * STEPS_PER_OCTAVE;
 
 fn lambda(step: u32) -> f64 {
@@ -115,14 +115,14 @@ impl<'a> GridSearch<'a> {
     }
 
     fn active_squares(&self, brick: usize, rung: Rung) -> f64 {
-        f64::from(self.cost(brick, rung).active_norm).powi(2)
+        self.cost(brick, rung).active_norm.powi(2)
     }
 
     /// The bits of a brick's texels and of all its records.
     fn bits(&self, brick: usize, rung: Rung) -> f64 {
         let texels = 8 * rung.codec().layout().brick_bytes() as u32;
-        let records = if rung == Rung::Empty { 0 } else { RECORD_BITS * self.records[brick] };
-        f64::from(texels + records)
+        let records = if rung == Rung::Empty { 0 } else { self.records[brick] };
+        f64::from(texels) + f64::from(RECORD_BITS) * f64::from(records)
     }
 
     /// The rung with the least D + λR; of equals the cheapest.
@@ -130,7 +130,13 @@ impl<'a> GridSearch<'a> {
         if let Some(rung) = self.lends[brick] {
             return rung;
         }
-        let lambda = lambda(step.max(self.least_step[brick]));
+        let step = step.max(self.least_step[brick]);
+        if step == 0 {
+            // The coarsest there is: no error is too large.
+            let possible = |rung: &Rung| self.cost(brick, *rung).norm.is_finite();
+            return Rung::ALL.into_iter().find(possible).unwrap_or(Rung::F32);
+        }
+        let lambda = lambda(step);
         let cost = |rung: Rung| self.distortion(brick, rung) + lambda * self.bits(brick, rung);
         let cheapest = Rung::ALL.into_iter().map(|rung| (rung, cost(rung)));
         cheapest.reduce(|best, next| if next.1 < best.1 { next } else { best }).expect("there are rungs").0
@@ -205,7 +211,7 @@ impl<'a> GridSearch<'a> {
             if self.squares(&picks) > allowed {
                 picks = fine;
             }
-            if !self.raise_frames(&picks, floor, advance)? {
+            if !self.raise_frames(&picks, floor, step, advance)? {
                 return Ok((step, picks));
             }
         }
@@ -253,7 +259,10 @@ impl<'a> GridSearch<'a> {
 
     pub(super) fn within(&mut self, bound: f64, advance: &mut dyn FnMut(u64)) -> io::Result<Vec<Rung>> {
         loop {
-            let fits = |brick, rung| f64::from(self.cost(brick, rung).max) <= bound;
+            let fits = |brick, rung| {
+                let cost = self.cost(brick, rung);
+                cost.norm.is_finite() && f64::from(cost.max) <= bound
+            };
             let cheapest = |brick| Rung::ALL.into_iter().find(|&r| fits(brick, r)).unwrap_or(Rung::F32);
             let picks: Vec<Rung> = (0..self.uses.len()).map(cheapest).collect();
             if !self.try_unknown((0..).zip(picks.iter().copied()), advance)? {
@@ -277,44 +286,60 @@ impl<'a> GridSearch<'a> {
         frames.filter(|db| db.is_finite()).fold(f64::INFINITY, f64::min)
     }
 
-    /// Binds the bricks of every frame below `floor` to the step at which it would reach it alone. Whether
-    /// there was such a frame.
+    /// Binds the bricks of every frame below `floor` to the step at which it would reach it alone, and at least to the
+    /// one after `current`, which was not enough. Whether there was such a frame.
     pub(super) fn raise_frames(
         &mut self,
         picks: &[Rung],
         floor: f64,
+        current: u32,
         advance: &mut dyn FnMut(u64),
     ) -> io::Result<bool> {
-        let mut raised = false;
-        for frame in 0..self.tree.frames.len() {
-            let allowed = self.allowance(self.tree.frames[frame].stats.active_leaf_voxels, floor);
+        // All are judged before loans are called in for the sake of some.
+        let low: Vec<(usize, f64)> = (0..self.tree.frames.len())
+            .map(|f| (f, self.allowance(self.tree.frames[f].stats.active_leaf_voxels, floor)))
+            .filter(|&(f, allowed)| {
+                let bricks = || self.tree.frame_bricks(&self.tree.frames[f]);
+                let squares: f64 =
+                    bricks().map(|id| self.active_squares(id as usize, picks[id as usize])).sum();
+                // What no step meets is met as nearly as the last one does.
+                squares > allowed && bricks().any(|id| self.least_step[id as usize] < LAST_STEP)
+            })
+            .collect();
+        for &(frame, allowed) in &low {
             let bricks: Vec<u32> = self.tree.frame_bricks(&self.tree.frames[frame]).collect();
-            let squares = |search: &Self, pick: &dyn Fn(usize) -> Rung| -> f64 {
-                bricks.iter().map(|&id| search.active_squares(id as usize, pick(id as usize))).sum()
-            };
-            // What no step meets is met as nearly as the last one does.
-            let bound = bricks.iter().all(|&id| self.least_step[id as usize] == LAST_STEP);
-            if bound || squares(self, &|brick| picks[brick]) <= allowed {
-                continue;
-            }
-            raised = true;
             let mut unique = bricks.clone();
             unique.sort_unstable();
             unique.dedup();
             self.call_in_loans(&unique);
             let step = loop {
-                let step = first_step(|step| squares(self, &|brick| self.pick(brick, step)) <= allowed);
+                let squares = |step| -> f64 {
+                    bricks
+                        .iter()
+                        .map(|&id| self.active_squares(id as usize, self.pick(id as usize, step)))
+                        .sum()
+                };
+                let step = first_step(|step| squares(step) <= allowed);
                 let picked: Vec<_> = unique.iter().map(|&id| (id, self.pick(id as usize, step))).collect();
                 if !self.try_unknown(picked.into_iter(), advance)? {
                     break step;
                 }
+            };
+            // Picks keep the error of all voxels small, floors are about that of active ones: a step may look enough
+            // that is not.
+            let least = |id: &u32| self.least_step[*id as usize];
+            let grows = unique.iter().any(|id| step > least(id).max(current));
+            let step = if grows {
+                step
+            } else {
+                (unique.iter().map(least).max().unwrap_or(0).max(current) + 1).min(LAST_STEP)
             };
             for id in unique {
                 let least = &mut self.least_step[id as usize];
                 *least = step.max(*least);
             }
         }
-        Ok(raised)
+        Ok(!low.is_empty())
     }
 
     /// Ends every loan that some bricks are part of: they are to become finer, and their texels others.

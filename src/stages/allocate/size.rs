@@ -58,19 +58,21 @@ fn floors_at_size(
     let (_, free) = at_size_above(searches, limit, fixed, &none, advance)?;
     let ends: Vec<(f64, f64)> =
         searches.iter().zip(&free).map(|(s, p)| (s.worst_frame(p), s.whole(p) - FRAME_MARGIN_DB)).collect();
-    if ends.iter().all(|(worst, wanted)| worst >= wanted) {
+    // A grid without error has no worst frame and no PSNR: neither is below the other.
+    let is_low = |(worst, wanted): &(f64, f64)| worst < wanted;
+    if !ends.iter().any(is_low) {
         return Ok(none);
     }
     let floors = |part: f64| -> Vec<f64> {
         let between = |&(worst, wanted): &(f64, f64)| worst + part * (wanted - worst);
-        ends.iter().map(|e| if e.0 >= e.1 { f64::NEG_INFINITY } else { between(e) }).collect()
+        ends.iter().map(|e| if is_low(e) { between(e) } else { f64::NEG_INFINITY }).collect()
     };
     let (mut low, mut high, mut best, mut best_is_even) = (0.0, 1.0, none, false);
     for _ in 0..FLOOR_HALVINGS {
         let middle = f64::midpoint(low, high);
         let (_, picks) = at_size_above(searches, limit, fixed, &floors(middle), advance)?;
-        let even = |(s, p): (&GridSearch, &Vec<Rung>)| s.worst_frame(p) >= s.whole(p) - FRAME_MARGIN_DB;
-        let is_even = searches.iter().zip(&picks).all(even);
+        let uneven = |(s, p): (&GridSearch, &Vec<Rung>)| s.worst_frame(p) < s.whole(p) - FRAME_MARGIN_DB;
+        let is_even = !searches.iter().zip(&picks).any(uneven);
         let fits = bytes(searches, &picks, fixed) <= limit;
         // The lowest floor that evens frames out, or else the highest that fits.
         if fits && (is_even || !best_is_even) {
@@ -107,30 +109,26 @@ fn at_size_above(
             continue;
         }
         let fine = all(searches, too_large);
-        let mut picks =
-            if bytes(searches, &fine, fixed) <= limit { fine.clone() } else { all(searches, fits) };
+        let picks = if bytes(searches, &fine, fixed) <= limit { fine.clone() } else { all(searches, fits) };
         let mut order: Vec<Switch> = Vec::new();
         for (g, (search, (coarse, fine))) in searches.iter().zip(picks.iter().zip(&fine)).enumerate() {
             order.extend(switches(g, search, coarse, fine));
         }
         order.sort_by(|a, b| b.gain.total_cmp(&a.gain));
-        let (mut counts, mut saved) = (counts(&picks), saved_bytes(searches, &picks));
-        for Switch { grid, brick, to, .. } in order {
-            let from = picks[grid][brick];
-            counts[from as usize] -= 1;
-            counts[to as usize] += 1;
-            picks[grid][brick] = to;
-            if from == Rung::Empty {
-                saved = saved_bytes(searches, &picks);
-            }
-            if fixed + texel_bytes(&counts) - saved > limit {
-                picks[grid][brick] = from;
-                break;
-            }
+        let moved = |count: usize| {
+            let mut picks = picks.clone();
+            order[..count].iter().for_each(|switch| picks[switch.grid][switch.brick] = switch.to);
+            picks
+        };
+        let (mut low, mut high) = (0, order.len());
+        while low < high {
+            let middle = (low + high).div_ceil(2);
+            if bytes(searches, &moved(middle), fixed) <= limit { low = middle } else { high = middle - 1 }
         }
+        let picks = moved(low);
         let mut raised = false;
         for ((search, picks), &floor) in searches.iter_mut().zip(&picks).zip(floors) {
-            raised |= search.raise_frames(picks, floor, advance)?;
+            raised |= search.raise_frames(picks, floor, fits, advance)?;
         }
         if !raised {
             return Ok((fits, picks));
@@ -160,7 +158,7 @@ fn texel_bytes(counts: &[u32; Rung::ALL.len()]) -> u64 {
 fn saved_bytes(searches: &[GridSearch], picks: &[Vec<Rung>]) -> u64 {
     let of_grid = |(search, picks): (&GridSearch, &Vec<Rung>)| {
         let empty = picks.iter().zip(&search.records).filter(|(rung, _)| **rung == Rung::Empty);
-        let records: u64 = empty.map(|(_, records)| u64::from(records * RECORD_BITS / 8)).sum();
+        let records: u64 = empty.map(|(_, records)| u64::from(*records) * u64::from(RECORD_BITS / 8)).sum();
         let tree = &*search.tree;
         let is_empty = |&record: &u32| match tree.records[record as usize].payload {
             Payload::Brick(id) => picks[id as usize] == Rung::Empty,

@@ -13,7 +13,7 @@ use crate::volume::{BRICK_VOXELS, Brick, InactiveRule, Mask512};
 /// Bricks that are in memory at once: 8 MB of voxels, enough batches for every core.
 const BRICKS_IN_FLIGHT: usize = 4096;
 
-/// The ways to code a brick, by ascending bits.
+/// The ways to code a brick.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Rung {
     /// Not at all: background, without a record.
@@ -29,6 +29,7 @@ pub(super) enum Rung {
 }
 
 impl Rung {
+    /// By ascending bits.
     pub const ALL: [Self; 8] = [
         Self::Empty,
         Self::Constant,
@@ -56,14 +57,14 @@ impl Rung {
 /// Rungs that may err.
 const LOSSY: usize = Rung::F32 as usize;
 
-/// What one codec does to one brick. Roots of sums rather than sums, so that `f32` is enough for what only decides.
+/// What one codec does to one brick.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Cost {
     /// Root of the squared error over the voxels that texels give; infinite where the codec is out of the
     /// question.
     pub norm: f64,
     /// The same over active voxels.
-    pub active_norm: f32,
+    pub active_norm: f64,
     /// The largest error that an engine can read, on any GPU.
     pub max: f32,
 }
@@ -71,8 +72,8 @@ pub(super) struct Cost {
 impl Cost {
     /// No error at all.
     pub const NONE: Self = Self { norm: 0.0, active_norm: 0.0, max: 0.0 };
-    pub const IMPOSSIBLE: Self = Self { norm: f64::INFINITY, active_norm: f32::INFINITY, max: f32::INFINITY };
-    const UNKNOWN: Self = Self { norm: f64::NAN, active_norm: f32::NAN, max: f32::NAN };
+    pub const IMPOSSIBLE: Self = Self { norm: f64::INFINITY, active_norm: f64::INFINITY, max: f32::INFINITY };
+    const UNKNOWN: Self = Self { norm: f64::NAN, active_norm: f64::NAN, max: f32::NAN };
 }
 
 /// What a constant brick's value keeps small.
@@ -161,7 +162,8 @@ impl Trials {
             };
             let as_constant = self.measure(brick, &texels.carried, &[constant; BRICK_VOXELS], None);
             let halves = brick.values.map(|v| f16::from_f32(v).to_f32());
-            let f16 = match halves.iter().all(|v| v.is_finite()) {
+            // Values just past the greatest half would round to it, but the codec refuses them.
+            let f16 = match brick.values.iter().all(|v| v.abs() <= f16::MAX.to_f32()) {
                 true => self.measure(brick, &texels.carried, &halves, None),
                 false => Cost::IMPOSSIBLE,
             };
@@ -214,7 +216,7 @@ impl Trials {
         }
         // Rounded up, because a bound is what it is compared with.
         let max = if f64::from(max as f32) < max { (max as f32).next_up() } else { max as f32 };
-        Cost { norm: squares.sqrt(), active_norm: active_squares.sqrt() as f32, max }
+        Cost { norm: squares.sqrt(), active_norm: active_squares.sqrt(), max }
     }
 
     /// The texels of a brick in a codec that was tried on it, and their packing axis.

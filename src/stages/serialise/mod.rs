@@ -152,7 +152,7 @@ pub fn serialise(
     Ok(writer.finish()?)
 }
 
-/// Bytes of the tree and its masks, which do not depend on how bricks are coded.
+/// Bytes of the tree and its masks.
 ///
 /// # Errors
 /// [`SerialiseError::TooLarge`].
