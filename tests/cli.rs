@@ -346,3 +346,26 @@ fn init_writes_a_manifest_that_builds() {
     let (code, error) = failure(&volpack(at, &["init", "packs"]));
     assert!(code == 3 && error.contains("no .vdb file"), "{code} {error}");
 }
+
+#[test]
+fn a_sweep_writes_tables_and_charts() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = folder.path();
+    let fog = fix("fog_half_blosc.vdb");
+    let sweep = ["sweep", &fog, "-o", "out", "--repeats", "1", "--trace", "0", "0"];
+    let text = stdout(&volpack(at, &sweep));
+    assert!(text.contains("psnr = 45") && text.contains("front"), "{text}");
+    let read = |name: &str| std::fs::read_to_string(at.join("out").join(name)).unwrap();
+    let json: Json = serde_json::from_str(&read("sweep.json")).unwrap();
+    let points = json["points"].as_array().unwrap();
+    let ours = points.iter().filter(|p| !p["method"].as_str().unwrap().starts_with("NanoVDB")).count();
+    assert_eq!(ours, 28, "every setting gives a point");
+    // Every point is a row, and what was asked for is in it.
+    assert_eq!(read("sweep.csv").lines().count(), points.len() + 1);
+    let at_45 = points.iter().find(|p| p["setting"] == "psnr = 45").unwrap();
+    assert!(at_45["psnr"].as_f64().unwrap() >= 45.0 && at_45["failures"].as_array().unwrap().is_empty());
+    assert!(read("sweep.svg").contains("no GPU here: not traced"));
+
+    let (code, error) = failure(&volpack(at, &["sweep", &fog, "-o", "out", "--grid", "typo", "--stability"]));
+    assert!(code == 2 && error.contains("typo"), "{code} {error}");
+}
