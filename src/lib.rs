@@ -24,16 +24,9 @@
 //! ```no_run
 //! use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 //! use volpack::settings::{Format, Settings};
-//! use volpack::verify::PictureSettings;
 //!
-//! let job = Job {
-//!     frames: vec!["smoke.vdb".into()],
-//!     output: "smoke.volpack".into(),
-//!     settings: Settings { format: Format::Bc7, ..Settings::default() },
-//!     strict: false,
-//!     verify: VerifyLevel::All,
-//!     pictures: PictureSettings::default(),
-//! };
+//! let settings = Settings { format: Format::Bc7, ..Settings::default() };
+//! let job = Job::new(vec!["smoke.vdb".into()], "smoke.volpack".into(), settings, VerifyLevel::All);
 //! let outcome = build(&job, &mut Silent)?;
 //! assert!(outcome.verification.is_some_and(|report| report.ok));
 //! # Ok::<(), volpack::error::Error>(())

@@ -51,6 +51,13 @@ pub struct Job {
     pub pictures: PictureSettings,
 }
 
+impl Job {
+    /// A build whose warnings are warnings, with the usual pictures.
+    pub fn new(frames: Vec<PathBuf>, output: PathBuf, settings: Settings, verify: VerifyLevel) -> Self {
+        Self { frames, output, settings, strict: false, verify, pictures: PictureSettings::default() }
+    }
+}
+
 /// Hears how a build is getting on. Called from one thread at a time.
 pub trait Progress {
     /// A stage begins, which has that many steps of that kind.

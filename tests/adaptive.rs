@@ -70,14 +70,7 @@ impl Case {
 
     /// Builds; the pack is in `folder` if its voxels verified.
     fn attempt(&self, settings: Settings, folder: &Path) -> Result<Outcome, Error> {
-        let job = Job {
-            frames: self.frames.clone(),
-            output: folder.join("test.volpack"),
-            settings,
-            strict: false,
-            verify: VerifyLevel::Voxels,
-            pictures: Default::default(),
-        };
+        let job = Job::new(self.frames.clone(), folder.join("test.volpack"), settings, VerifyLevel::Voxels);
         build(&job, &mut Silent)
     }
 

@@ -89,14 +89,12 @@ fn every_format_keeps_its_promise_on_every_fixture() {
 #[test]
 fn values_past_half_are_refused_by_name() {
     let folder = tempfile::tempdir().unwrap();
-    let job = volpack::pipeline::Job {
-        frames: vec![fixture("degenerate.vdb")],
-        output: folder.path().join("x.volpack"),
-        settings: settings("huge_range", Format::F16),
-        strict: false,
-        verify: volpack::pipeline::VerifyLevel::Voxels,
-        pictures: Default::default(),
-    };
+    let job = volpack::pipeline::Job::new(
+        vec![fixture("degenerate.vdb")],
+        folder.path().join("x.volpack"),
+        settings("huge_range", Format::F16),
+        volpack::pipeline::VerifyLevel::Voxels,
+    );
     let error = volpack::pipeline::build(&job, &mut volpack::pipeline::Silent).err().unwrap();
     assert!(error.to_string().contains("huge_range") && error.to_string().contains("f16"), "{error}");
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "something was left behind");

@@ -99,14 +99,12 @@ fn the_shader_sees_what_the_cpu_sees() {
         for format in Format::ALL {
             let settings = Settings { grids: vec![grid.to_owned()], format, ..Settings::default() };
             let output = folder.path().join("test.volpack");
-            let job = volpack::pipeline::Job {
-                frames: frames.clone(),
+            let job = volpack::pipeline::Job::new(
+                frames.clone(),
                 output,
                 settings,
-                strict: false,
-                verify: volpack::pipeline::VerifyLevel::None,
-                pictures: Default::default(),
-            };
+                volpack::pipeline::VerifyLevel::None,
+            );
             volpack::pipeline::build(&job, &mut volpack::pipeline::Silent).unwrap();
             let pack = Pack::open(&job.output).unwrap();
             let uploaded = gpu.upload(&pack).unwrap();

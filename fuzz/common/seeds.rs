@@ -95,14 +95,12 @@ pub fn build_packs(fixtures: &Path, out: &Path) -> Result<()> {
     for (name, files, grids) in sources {
         for format in Format::ALL {
             for zstd in [0, 3] {
-                let job = Job {
-                    frames: files.iter().map(|file| fixtures.join(format!("{file}.vdb"))).collect(),
-                    output: out.join(format!("{name}_{}_{zstd}.volpack", format.name())),
-                    settings: Settings { grids: grids.clone(), format, zstd, ..Settings::default() },
-                    strict: false,
-                    verify: VerifyLevel::None,
-                    pictures: Default::default(),
-                };
+                let job = Job::new(
+                    files.iter().map(|file| fixtures.join(format!("{file}.vdb"))).collect(),
+                    out.join(format!("{name}_{}_{zstd}.volpack", format.name())),
+                    Settings { grids: grids.clone(), format, zstd, ..Settings::default() },
+                    VerifyLevel::None,
+                );
                 build(&job, &mut Silent)?;
             }
         }

@@ -17,7 +17,7 @@ use crate::error::{Error, Result};
 use crate::pipeline::VerifyLevel;
 use crate::render::Device;
 use crate::settings::{
-    ClusterArgs, DEFAULT_ZSTD, Format, Masks, NonFinite, QualityArgs, RangeMode, Settings,
+    ClusterArgs, DEFAULT_ZSTD, Format, Masks, NonFinite, QualityArgs, RangeMode, Settings, above_zero,
 };
 use crate::verify::PictureSettings;
 
@@ -156,15 +156,11 @@ struct PictureArgs {
     #[arg(long, value_name = "DIR")]
     images: Option<PathBuf>,
     /// The largest mean FLIP that passes [default: by format, or as the manifest says]
-    #[arg(long, value_name = "FLIP", value_parser = positive_f64)]
+    #[arg(long, value_name = "FLIP", value_parser = above_zero)]
     max_flip: Option<f64>,
     /// What traces the pack as an engine would
     #[arg(long, default_value = "auto")]
     device: Device,
-}
-
-fn positive_f64(text: &str) -> std::result::Result<f64, String> {
-    positive(text).map(f64::from)
 }
 
 impl PictureArgs {

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::collections::{HashMap, HashSet};
 
 use super::tree::{self, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS, header, l1_words};
-use super::{Frame, Grid, Pack, PackError};
+use super::{Atlas, Frame, Grid, Pack, PackError};
 use crate::codec::{BrickRange, Codec, decode, spread};
 use crate::volume::{
     BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, CoordBox, InactiveRule, Mask512, ROOT_DIM,
@@ -60,6 +60,11 @@ impl Pack {
             return Err(PackError::Corrupt(format!("frame {frame} lists chunks that are not texels")));
         }
         Ok(FrameReader { pack: self, grid, frame, slabs })
+    }
+
+    /// What a GPU has to hold: tree, masks and texture pages.
+    pub fn gpu_bytes(&self) -> u64 {
+        self.tree.len() as u64 * 4 + self.atlases.iter().map(Atlas::bytes).sum::<u64>()
     }
 
     /// Whether bricks of different ranges use the texels of a record: they suit neither one exactly.

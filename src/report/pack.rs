@@ -70,13 +70,13 @@ impl PackSummary {
 
         let squares = squares_by_codec(pack);
         let error: f64 = squares.iter().sum();
-        let texels: u64 = pack.atlases.iter().map(Atlas::bytes).sum();
+        let texel_bytes: u64 = pack.atlases.iter().map(Atlas::bytes).sum();
         let part = |part: f64, whole: f64| if whole > 0.0 { part / whole } else { 0.0 };
         for (tag, squares) in squares.into_iter().enumerate() {
             let codec = Codec::from_tag(tag as u32).expect("there are six");
             if squares > 0.0 || codecs.contains_key(codec.name()) {
                 let entry = codecs.entry(codec.name()).or_default();
-                entry.share_of_bytes = part(entry.bytes as f64, texels as f64);
+                entry.share_of_bytes = part(entry.bytes as f64, texel_bytes as f64);
                 entry.share_of_error = part(squares, error);
             }
         }
@@ -88,8 +88,7 @@ impl PackSummary {
         let source_leaves = leaves.fold(0, u64::saturating_add);
         let mask_bytes = u64::from(words[header::MASKS]) * MASK_WORDS as u64 * 4;
         let tree_bytes = words.len() as u64 * 4 - mask_bytes;
-        let texel_bytes = texels;
-        let gpu_bytes = tree_bytes + mask_bytes + texel_bytes;
+        let gpu_bytes = pack.gpu_bytes();
         Self {
             grids: pack.grids.iter().map(|g| g.name.clone()).collect(),
             frames: frames.len() as u64,
@@ -116,7 +115,7 @@ impl PackSummary {
 fn squares_by_codec(pack: &Pack) -> [f64; 6] {
     let mut squares = [0.0; 6];
     for grid in &pack.grids {
-        let peak = f64::from(grid.record.active_max) - f64::from(grid.record.active_min);
+        let peak = grid.record.peak();
         for (sum, norm) in squares.iter_mut().zip(grid.record.codec_norms) {
             let norm = f64::from(norm);
             // Where all active values are one there is no range to measure by.

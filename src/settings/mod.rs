@@ -7,7 +7,7 @@ use clap::ValueEnum;
 use serde::{Deserialize, Serialize};
 
 pub use clustering::{ClusterArgs, Clustering, Dedup, NOT_WITH_ADAPTIVE};
-pub use quality::{ByteSize, DEFAULT_PSNR, ErrorBound, FRAME_MARGIN_DB, Quality, QualityArgs};
+pub use quality::{ByteSize, DEFAULT_PSNR, ErrorBound, FRAME_MARGIN_DB, Quality, QualityArgs, above_zero};
 
 use crate::codec::Codec;
 

@@ -7,8 +7,8 @@
 //! | 3 | [`flatten`] | [`crate::volume::FlatFrame`]: cells and bricks of one frame |
 //! | 4 | [`dedup`] | [`dedup::SequenceTree`]: nodes and bricks shared across the sequence |
 //! | 5 | [`allocate`] | [`allocate::Allocation`]: which codec each brick gets, and its range |
-//! | 6 | [`relayout`] | [`crate::pack::Atlas`]: where each brick lies in the pages of a texture |
-//! | 7 | [`quantise`] | encoded slabs of the atlas |
+//! | 6 | [`relayout`] | [`relayout::Layout`]: where each brick lies in the pages of its codec's texture |
+//! | 7 | [`quantise`] | encoded slabs of each atlas |
 //! | 8 | [`serialise`] | the `.volpack` file |
 
 pub mod allocate;

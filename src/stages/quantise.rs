@@ -8,10 +8,7 @@ use super::allocate::{Allocation, Coding};
 use super::dedup::{SequenceTree, carried};
 use super::relayout::{self, PlannedAtlas, Texture, TextureOf};
 use crate::codec::{Codec, OutOfRange, Texels, decode, encode};
-use crate::volume::{Brick, InactiveRule};
-
-/// Bricks that are in memory at once: 8 MB of voxels, enough batches for every core.
-const BRICKS_IN_FLIGHT: u32 = 4096;
+use crate::volume::{BRICKS_IN_FLIGHT, Brick, InactiveRule};
 
 /// One grid's bricks and how they are coded.
 pub struct GridBricks<'a> {
@@ -198,8 +195,7 @@ fn encode_bricks(
             0.0
         } else {
             let decoded = decode(codec, bytes, axis, sequence, texels.range);
-            let square = |i: usize| (f64::from(decoded[i]) - f64::from(brick.values[i])).powi(2);
-            texels.carried.ones().map(square).sum::<f64>().sqrt()
+            brick.error_norm(&decoded, &texels.carried)
         };
         Encoded { bytes: bytes.to_vec(), axis, norm: Some(norm) }
     });

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 
 use crate::pack::{FrameReader, PackError, Region};
-use crate::volume::{BRICK_DIM, BRICK_VOXELS, CellContent, Child, Coord, FlatFrame, Mask512};
+use crate::volume::{BRICK_DIM, BRICK_VOXELS, Coord, FlatFrame, Mask512};
 
 /// The bricks of one frame by their smallest corner.
 pub struct Bricks {
@@ -15,19 +15,9 @@ pub struct Bricks {
 impl Bricks {
     /// Those of the source.
     pub fn of_source(frame: &FlatFrame) -> Self {
-        let mut bricks = Self { by_origin: HashMap::new(), order: Vec::new() };
-        for cell in &frame.cells {
-            let CellContent::Node(children) = &cell.content else { continue };
-            for (place, child) in children {
-                if let Child::Brick(id) = child {
-                    let origin = cell.origin.offset_by(Coord::child_offset((*place).into(), 4, BRICK_DIM));
-                    let brick = &frame.bricks[*id as usize];
-                    bricks.by_origin.insert(origin, (Box::new(brick.values), brick.active));
-                    bricks.order.push(origin);
-                }
-            }
-        }
-        bricks
+        let order = frame.brick_origins();
+        let each = order.iter().zip(&frame.bricks);
+        Self { by_origin: each.map(|(at, b)| (*at, (Box::new(b.values), b.active))).collect(), order }
     }
 
     /// What a pack has where the source has these. Which voxels are active is the source's.
@@ -46,18 +36,14 @@ impl Bricks {
         Ok(Self { by_origin: each.collect::<Result<_, PackError>>()?, order: self.order.clone() })
     }
 
-    /// The sum of squared differences over active voxels, and the largest.
-    pub fn difference(&self, other: &Self) -> (f64, f64) {
-        let (mut squares, mut max) = (0.0, 0.0f64);
+    /// How far other bricks in the same places are from these, over active voxels.
+    pub fn difference(&self, other: &Self) -> Difference {
+        let mut out = Difference::default();
         for at in &self.order {
             let ((ours, active), (theirs, _)) = (&self.by_origin[at], &other.by_origin[at]);
-            for i in active.ones() {
-                let error = (f64::from(ours[i]) - f64::from(theirs[i])).abs();
-                squares += error * error;
-                max = max.max(error);
-            }
+            active.ones().for_each(|i| out.voxel(ours[i], theirs[i]));
         }
-        (squares, max)
+        out
     }
 
     /// How much neighbouring active voxels differ.
@@ -113,5 +99,38 @@ impl Jumps {
     /// How much blockier these are than those of the source: 1 is not at all. Not a number where nothing varies.
     pub fn blockiness(&self, source: &Self) -> f64 {
         self.ratio() / source.ratio()
+    }
+}
+
+/// Errors over active leaf voxels.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Difference {
+    /// Active leaf voxels.
+    pub voxels: u64,
+    /// Sum of squared differences.
+    pub squares: f64,
+    /// The largest difference.
+    pub max: f64,
+}
+
+impl Difference {
+    /// Adds one voxel.
+    pub(super) fn voxel(&mut self, ours: f32, theirs: f32) {
+        let error = (f64::from(ours) - f64::from(theirs)).abs();
+        self.voxels += 1;
+        self.squares += error * error;
+        self.max = self.max.max(error);
+    }
+
+    /// Adds another frame's.
+    pub fn add(&mut self, other: &Self) {
+        self.voxels += other.voxels;
+        self.squares += other.squares;
+        self.max = self.max.max(other.max);
+    }
+
+    /// In dB under `peak`; `None` where there is no error.
+    pub fn psnr(&self, peak: f64) -> Option<f64> {
+        (self.squares > 0.0).then(|| 10.0 * (self.voxels as f64 * peak * peak / self.squares).log10())
     }
 }

@@ -15,8 +15,8 @@ use crate::pipeline::{Job, Progress, VerifyLevel};
 use crate::report::chart::{self, Point, Spread};
 use crate::settings::{Clustering, ErrorBound, Format, NonFinite, Quality, RangeMode, Settings};
 
-pub use field::Jumps;
-pub use points::{Difference, difference, measure};
+pub use field::{Difference, Jumps};
+pub use points::{difference, measure};
 pub use stability::stability;
 
 /// What is measured, and how.
@@ -166,14 +166,7 @@ impl Options {
     }
 
     fn job(&self, method: &Method, frames: &[PathBuf], output: PathBuf) -> Job {
-        Job {
-            frames: frames.to_vec(),
-            output,
-            settings: method.settings.clone(),
-            strict: false,
-            verify: VerifyLevel::None,
-            pictures: Default::default(),
-        }
+        Job::new(frames.to_vec(), output, method.settings.clone(), VerifyLevel::None)
     }
 }
 

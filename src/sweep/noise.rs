@@ -1,6 +1,6 @@
 //! Small changes of the input, to see what a method makes of them.
 
-use crate::volume::{BRICK_DIM, CellContent, Child, Coord, FlatFrame, ValueRange};
+use crate::volume::{CellContent, Child, Coord, FlatFrame, ValueRange};
 
 /// What is added to active voxels of bricks.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -15,25 +15,19 @@ impl Noise {
     /// Changes a frame; the same seed changes the same voxels by the same.
     pub fn apply(self, frame: &mut FlatFrame, seed: u64) {
         let range = frame.stats.active_range.unwrap_or(ValueRange::of(0.0));
-        let width = f64::from(range.max) - f64::from(range.min);
-        for cell in &frame.cells {
-            let CellContent::Node(children) = &cell.content else { continue };
-            for (place, child) in children {
-                let Child::Brick(id) = child else { continue };
-                let origin = cell.origin.offset_by(Coord::child_offset((*place).into(), 4, BRICK_DIM));
-                let brick = &mut frame.bricks[*id as usize];
-                for i in brick.active.ones() {
-                    let random = hash(seed, origin, i);
-                    let value = brick.values[i];
-                    brick.values[i] = match self {
-                        Self::Ulp if random & 1 == 0 => value.next_up(),
-                        Self::Ulp => value.next_down(),
-                        Self::Fraction(fraction) => {
-                            let unit = random as f64 / u64::MAX as f64 * 2.0 - 1.0;
-                            (f64::from(value) + fraction * width * unit) as f32
-                        }
-                    };
-                }
+        let origins = frame.brick_origins();
+        for (brick, origin) in frame.bricks.iter_mut().zip(origins) {
+            for i in brick.active.ones() {
+                let random = hash(seed, origin, i);
+                let value = brick.values[i];
+                brick.values[i] = match self {
+                    Self::Ulp if random & 1 == 0 => value.next_up(),
+                    Self::Ulp => value.next_down(),
+                    Self::Fraction(fraction) => {
+                        let unit = random as f64 / u64::MAX as f64 * 2.0 - 1.0;
+                        (f64::from(value) + fraction * range.width() * unit) as f32
+                    }
+                };
             }
         }
         frame.stats.active_range = ValueRange::union_all(active(frame));

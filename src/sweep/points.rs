@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::Instant;
 
-use super::field::{Bricks, Jumps};
+use super::field::{Bricks, Difference, Jumps};
 use super::nanovdb::{self, NanoError, Quantise};
 use super::{Method, Options, Skipped, Sweep, each};
 use crate::error::{Error, Result};
@@ -18,9 +18,6 @@ use crate::stages::select::find;
 use crate::vdb::{Accessor, GridClass, GridInfo, Tree, VdbFile, with_scalar_type};
 use crate::verify::{self, Sources};
 use crate::volume::{Coord, FlatFrame, ValueRange};
-
-/// Frames whose blockiness is measured: the first, the last and the one between, as for pictures.
-const BLOCKY_FRAMES: usize = 3;
 
 /// Tolerances of NanoVDB's FpN, as fractions of the range of values.
 const FPN: [f64; 6] = [0.1, 0.05, 0.02, 0.01, 0.005, 0.002];
@@ -82,10 +79,8 @@ impl Source {
         let grids: Vec<String> = options.grid.iter().cloned().collect();
         let selection = crate::stages::select::select(&sequence, &grids)?;
         let grid = selection.grids[0].name.clone();
-        let count = sequence.frames.len();
-        let mut shown: Vec<usize> =
-            (0..BLOCKY_FRAMES.min(count)).map(|i| i * (count - 1) / (BLOCKY_FRAMES - 1)).collect();
-        shown.dedup();
+        // Blockiness is measured where pictures are taken.
+        let shown = verify::shown_frames(sequence.frames.len());
         let (mut range, mut jumps, mut kept) = (None, Jumps::default(), Vec::new());
         for (i, frame) in sequence.frames.iter().enumerate() {
             let Some(flat) = flat_frame(&frame.path, &grid, options)? else { continue };
@@ -96,7 +91,7 @@ impl Source {
                 kept.push((i, bricks));
             }
         }
-        let peak = range.map_or(0.0, |r| f64::from(r.max) - f64::from(r.min));
+        let peak = range.map_or(0.0, ValueRange::width);
         Ok(Self { grid, peak, shown: kept, jumps })
     }
 }
@@ -220,31 +215,6 @@ pub enum PeerError {
     File(#[from] Error),
 }
 
-/// Errors over active leaf voxels.
-#[derive(Clone, Copy, Debug, Default)]
-pub struct Difference {
-    /// Active leaf voxels.
-    pub voxels: u64,
-    /// Sum of squared differences.
-    pub squares: f64,
-    /// The largest difference.
-    pub max: f64,
-}
-
-impl Difference {
-    /// Adds another frame's.
-    pub fn add(&mut self, other: &Self) {
-        self.voxels += other.voxels;
-        self.squares += other.squares;
-        self.max = self.max.max(other.max);
-    }
-
-    /// In dB under `peak`; `None` where there is no error.
-    pub fn psnr(&self, peak: f64) -> Option<f64> {
-        (self.squares > 0.0).then(|| 10.0 * (self.voxels as f64 * peak * peak / self.squares).log10())
-    }
-}
-
 /// How far a grid of one OpenVDB file is from that of another, over the first one's active leaf voxels.
 ///
 /// # Errors
@@ -267,10 +237,7 @@ pub fn difference(source: &Path, other: &Path, grid: &str) -> Result<Difference>
                 for i in tree.leaves.masks[leaf].ones() {
                     let at = tree.leaves.origins[leaf].offset_by(Coord::child_offset(i, 3, 1));
                     let ours = crate::vdb::Scalar::to_f32(tree.leaves.values(leaf)[i]);
-                    let error = (f64::from(ours) - f64::from(accessor.get(at).0)).abs();
-                    out.voxels += 1;
-                    out.squares += error * error;
-                    out.max = out.max.max(error);
+                    out.voxel(ours, accessor.get(at).0);
                 }
             }
         },

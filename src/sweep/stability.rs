@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::field::{Bricks, Jumps};
+use super::field::{Bricks, Difference, Jumps};
 use super::noise::Noise;
 use super::points::flat_frame;
 use super::{Method, Options, Stability, each};
@@ -137,7 +137,7 @@ fn run(options: &Options, method: &Method, variation: Variation, folder: &Path) 
     let pack = Pack::open(&job.output).map_err(Error::pack(&job.output))?;
     let bytes = std::fs::read(&job.output).map_err(Error::io(&job.output))?;
     let grid = &pack.grids[0];
-    let (mut squares, mut max, mut voxels, mut range) = (0.0, 0.0f64, 0, None);
+    let (mut difference, mut range) = (Difference::default(), None);
     let mut jumps = [Jumps::default(); 2];
     for (f, frame) in grid.frames.iter().enumerate() {
         let name = &pack.provenance.sources[frame.record.source as usize].file;
@@ -146,21 +146,20 @@ fn run(options: &Options, method: &Method, variation: Variation, folder: &Path) 
         let Some(mut flat) = flat_frame(path, &grid.name, options)? else { continue };
         alter(&mut flat);
         range = ValueRange::union_all(range.into_iter().chain(flat.stats.active_range));
-        voxels += flat.stats.active_leaf_voxels;
         let source = Bricks::of_source(&flat);
         let reader = pack.frame(0, f).map_err(Error::pack(&job.output))?;
         let packed = source.in_pack(&reader).map_err(Error::pack(&job.output))?;
-        let (s, m) = source.difference(&packed);
-        squares += s;
-        max = max.max(m);
+        // Leaves of one value are no bricks: they are exact, and count.
+        let bricks = source.difference(&packed);
+        difference.add(&Difference { voxels: flat.stats.active_leaf_voxels, ..bricks });
         jumps[0].add(&source.jumps());
         jumps[1].add(&packed.jumps());
     }
-    let peak = range.map_or(0.0, |r| f64::from(r.max) - f64::from(r.min));
+    let peak = range.map_or(0.0, ValueRange::width);
     Ok(Run {
-        psnr: 10.0 * (voxels as f64 * peak * peak / squares).log10(),
+        psnr: difference.psnr(peak).unwrap_or(f64::INFINITY),
         bits_per_voxel: PackSummary::new(&pack).bits_per_voxel,
-        max_error: if peak > 0.0 { max / peak } else { 0.0 },
+        max_error: if peak > 0.0 { difference.max / peak } else { 0.0 },
         jumps,
         digest: blake3::hash(&bytes),
         variation,

@@ -101,8 +101,7 @@ pub(super) fn compare<T: Scalar>(
     settings: &Settings,
 ) -> FrameError {
     let voxel_size = info.transform.matrix.as_ref().map_or(1.0, voxel_size);
-    let record = &reader.grid().record;
-    let peak = f64::from(record.active_max) - f64::from(record.active_min);
+    let peak = reader.grid().record.peak();
     let max_error = match settings.quality {
         Quality::MaxError(bound) if settings.format == Format::Adaptive => {
             Some(bound.absolute(peak, voxel_size))
@@ -266,7 +265,7 @@ impl<T: Scalar> Comparison<'_, T> {
                 let (source, mask) = (self.tree.leaves.values(leaf), &self.tree.leaves.masks[leaf]);
                 let carried = (0..BRICK_VOXELS).filter(|&i| mask.get(i) || !exact_inactive);
                 let range = ValueRange::union_all(carried.map(|i| ValueRange::of(self.value(source[i]))));
-                Bound::Within(range.map_or(0.0, |r| f64::from(r.max) - f64::from(r.min)))
+                Bound::Within(range.map_or(0.0, ValueRange::width))
             }
             Codec::Constant | Codec::F32 => Bound::Exact,
             Codec::F16 => Bound::Half,

@@ -124,7 +124,7 @@ fn broken_promises(pack: &Pack, grids: &[GridReport], frames: &[FrameReport]) ->
         let db = below(&f.active, floor?)?;
         Some(format!("grid {:?} frame {}: {db:.3} dB, at least {} were promised", f.grid, f.frame, floor?))
     }));
-    let bytes = pack.tree.len() as u64 * 4 + pack.atlases.iter().map(|a| a.bytes()).sum::<u64>();
+    let bytes = pack.gpu_bytes();
     let leaves =
         pack.grids.iter().flat_map(|g| &g.frames).map(|f| f.record.leaves).fold(0, u64::saturating_add);
     match settings.quality {
@@ -147,7 +147,7 @@ impl VerifyReport {
         let (mut grids, mut frames, mut failures) = (Vec::new(), Vec::new(), Vec::new());
         for (grid, errors) in pack.grids.iter().zip(errors) {
             let range = super::union(&errors);
-            let peak = range.map_or(0.0, |r| f64::from(r.max) - f64::from(r.min));
+            let peak = range.map_or(0.0, ValueRange::width);
             let recorded = ValueRange { min: grid.record.active_min, max: grid.record.active_max };
             if range.is_some_and(|range| range != recorded) {
                 failures.push(format!(

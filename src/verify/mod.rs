@@ -16,7 +16,9 @@ use rayon::prelude::*;
 
 pub use compare::SIGN_MATTERS_VOXELS;
 pub use metrics::{FrameReport, GridReport, Metrics, VerifyReport, WorstFrame};
-pub use pictures::{PictureReport, PictureSettings, PicturesReport, TracerDifference, pictures};
+pub use pictures::{
+    PictureReport, PictureSettings, PicturesReport, TracerDifference, pictures, shown_frames,
+};
 
 use crate::error::{Error, Result};
 use crate::pack::Pack;

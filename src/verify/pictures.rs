@@ -150,7 +150,8 @@ pub fn pictures(pack: &Pack, sources: &Sources, settings: &PictureSettings) -> R
     Ok(report)
 }
 
-fn shown_frames(count: usize) -> Vec<usize> {
+/// The places of the frames of a sequence that are shown.
+pub fn shown_frames(count: usize) -> Vec<usize> {
     let mut frames: Vec<usize> =
         (0..FRAMES.min(count)).map(|i| i * (count - 1) / (FRAMES - 1).max(1)).collect();
     frames.dedup();

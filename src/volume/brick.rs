@@ -75,6 +75,13 @@ impl Brick {
         )
     }
 
+    /// The root of the sum of squared differences between other values and this brick's, over the voxels that
+    /// `carried` names.
+    pub fn error_norm(&self, values: &[f32; BRICK_VOXELS], carried: &Mask512) -> f64 {
+        let square = |i: usize| (f64::from(values[i]) - f64::from(self.values[i])).powi(2);
+        carried.ones().map(square).sum::<f64>().sqrt()
+    }
+
     /// Smallest and largest value among the voxels that `carried` names.
     pub fn range_over(&self, carried: &Mask512) -> Option<(f32, f32)> {
         carried.ones().map(|i| self.values[i]).fold(None, |range, v| match range {

@@ -1,6 +1,6 @@
 //! One grid of one frame, flattened: constant regions and bricks by 128³ cell.
 
-use super::{Brick, Coord, CoordBox};
+use super::{BRICK_DIM, Brick, Coord, CoordBox};
 
 /// A region of one value.
 #[derive(Clone, Copy, Debug)]
@@ -61,6 +61,11 @@ impl ValueRange {
         Self { min: value, max: value }
     }
 
+    /// The largest less the smallest.
+    pub fn width(self) -> f64 {
+        f64::from(self.max) - f64::from(self.min)
+    }
+
     /// The smallest range around both.
     pub fn union(self, other: Self) -> Self {
         Self { min: self.min.min(other.min), max: self.max.max(other.max) }
@@ -87,6 +92,23 @@ pub struct FrameStats {
     pub active_range: Option<ValueRange>,
     /// Values that were infinite or not a number.
     pub nonfinite: u64,
+}
+
+impl FlatFrame {
+    /// The smallest corner of each of its bricks.
+    pub fn brick_origins(&self) -> Vec<Coord> {
+        let mut origins = Vec::with_capacity(self.bricks.len());
+        for cell in &self.cells {
+            let CellContent::Node(children) = &cell.content else { continue };
+            let bricks = children.iter().filter(|(_, child)| matches!(child, Child::Brick(_)));
+            origins.extend(
+                bricks.map(|(place, _)| {
+                    cell.origin.offset_by(Coord::child_offset((*place).into(), 4, BRICK_DIM))
+                }),
+            );
+        }
+        origins
+    }
 }
 
 /// One grid of one frame in absolute index coordinates.

@@ -11,6 +11,9 @@ use super::{BRICK_VOXELS, Brick, Mask512};
 /// Bytes of one brick in the scratch file: values, mask, and whether there is one.
 const SCRATCH_BRICK_BYTES: usize = BRICK_VOXELS * 4 + 64 + 1;
 
+/// Bricks that are read back at a time: 8 MB of voxels, enough batches of an encoder for every core.
+pub const BRICKS_IN_FLIGHT: u32 = 4096;
+
 /// Stores bricks so that equal ones are kept once, and gives them back by number.
 ///
 /// Memory is about 50 bytes a unique brick; the 2 KB of voxels go to an unnamed temporary file.

@@ -50,14 +50,7 @@ pub fn probes(facts: &Json) -> impl Iterator<Item = ([i32; 3], f64, bool)> + '_ 
 /// Builds a pack of `frames` in a folder that the caller keeps, and compares every voxel.
 pub fn build_verified(frames: &[PathBuf], settings: Settings, folder: &Path) -> (Pack, VerifyReport) {
     let output = folder.join("test.volpack");
-    let job = Job {
-        frames: frames.to_vec(),
-        output,
-        settings,
-        strict: false,
-        verify: VerifyLevel::Voxels,
-        pictures: Default::default(),
-    };
+    let job = Job::new(frames.to_vec(), output, settings, VerifyLevel::Voxels);
     let outcome = build(&job, &mut Silent).unwrap_or_else(|e| panic!("{frames:?}: {e}"));
     (Pack::open(&job.output).unwrap(), outcome.verification.unwrap())
 }

@@ -39,14 +39,12 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     for sequence in &args.sequences {
         let (name, frames) = sequence::named(sequence)?;
         let measure = |clustering| -> Result<(u32, f64, f64), Box<dyn Error>> {
-            let job = Job {
-                frames: frames.clone(),
-                output: folder.path().join("bench.volpack"),
-                settings: Settings { format: Format::Bc7, clustering, ..Settings::default() },
-                strict: false,
-                verify: VerifyLevel::Voxels,
-                pictures: Default::default(),
-            };
+            let job = Job::new(
+                frames.clone(),
+                folder.path().join("bench.volpack"),
+                Settings { format: Format::Bc7, clustering, ..Settings::default() },
+                VerifyLevel::Voxels,
+            );
             let report = build(&job, &mut Silent)?.verification.ok_or("it was verified")?;
             let bricks = Pack::open(&job.output)?.atlas(Codec::Bc7).map_or(0, |a| a.bricks);
             let grid = &report.grids[0];

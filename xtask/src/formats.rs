@@ -38,14 +38,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 }
                 let settings = Settings { format, range, ..Settings::default() };
                 let output = folder.path().join("bench.volpack");
-                let mut job = Job {
-                    frames: frames.clone(),
-                    output,
-                    settings,
-                    strict: false,
-                    verify: VerifyLevel::None,
-                    pictures: Default::default(),
-                };
+                let mut job = Job::new(frames.clone(), output, settings, VerifyLevel::None);
                 let start = Instant::now();
                 build(&job, &mut Silent)?;
                 let seconds = start.elapsed().as_secs_f64();

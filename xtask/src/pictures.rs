@@ -29,14 +29,12 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     for sequence in &args.sequences {
         let (name, frames) = sequence::named(sequence)?;
         for format in Format::ALL {
-            let job = Job {
-                frames: frames.clone(),
-                output: folder.path().join("bench.volpack"),
-                settings: Settings { format, ..Settings::default() },
-                strict: false,
-                verify: VerifyLevel::None,
-                pictures: PictureSettings::default(),
-            };
+            let job = Job::new(
+                frames.clone(),
+                folder.path().join("bench.volpack"),
+                Settings { format, ..Settings::default() },
+                VerifyLevel::None,
+            );
             build(&job, &mut Silent)?;
             let pack = Pack::open(&job.output)?;
             let settings = PictureSettings { device: args.device, ..PictureSettings::default() };

@@ -91,14 +91,12 @@ fn pack(
     quality: Quality,
     folder: &Path,
 ) -> Result<Measured, Box<dyn Error>> {
-    let job = Job {
-        frames: vec![file.to_owned()],
-        output: folder.join("bench.volpack"),
-        settings: Settings { grids: vec![args.grid.clone()], format, quality, ..Settings::default() },
-        strict: false,
-        verify: VerifyLevel::Voxels,
-        pictures: Default::default(),
-    };
+    let job = Job::new(
+        vec![file.to_owned()],
+        folder.join("bench.volpack"),
+        Settings { grids: vec![args.grid.clone()], format, quality, ..Settings::default() },
+        VerifyLevel::Voxels,
+    );
     let report = build(&job, &mut Silent)?.verification.ok_or("it was verified")?;
     let grid = &report.grids[0];
     let summary = PackSummary::new(&Pack::open(&job.output)?);

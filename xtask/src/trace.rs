@@ -39,14 +39,12 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     for path in &args.files {
         let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         for format in Format::ALL {
-            let job = Job {
-                frames: vec![path.clone()],
-                output: folder.path().join("bench.volpack"),
-                settings: Settings { format, ..Settings::default() },
-                strict: false,
-                verify: VerifyLevel::None,
-                pictures: Default::default(),
-            };
+            let job = Job::new(
+                vec![path.clone()],
+                folder.path().join("bench.volpack"),
+                Settings { format, ..Settings::default() },
+                VerifyLevel::None,
+            );
             build(&job, &mut Silent)?;
             let pack = Pack::open(&job.output)?;
             let uploaded = gpu.upload(&pack)?;

@@ -3,8 +3,6 @@
 //! The pages are 1200 units wide and scale with the page that holds them. Text is 16 units or more: at half
 //! width, where many documentation pages show a picture, that is still 8 px.
 
-use std::fmt;
-
 use plotters::drawing::DrawingAreaErrorKind;
 
 mod axis;
@@ -70,20 +68,12 @@ pub struct Spread {
 }
 
 /// Why a chart could not be drawn.
-#[derive(Debug)]
+#[derive(Debug, thiserror::Error)]
 pub enum ChartError {
     /// The drawing library refused.
+    #[error("cannot draw the chart: {0}")]
     Draw(String),
 }
-
-impl fmt::Display for ChartError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let ChartError::Draw(why) = self;
-        write!(f, "cannot draw the chart: {why}")
-    }
-}
-
-impl std::error::Error for ChartError {}
 
 impl<E: std::error::Error + Send + Sync> From<DrawingAreaErrorKind<E>> for ChartError {
     fn from(e: DrawingAreaErrorKind<E>) -> Self {

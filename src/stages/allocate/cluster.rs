@@ -9,10 +9,7 @@ use super::{AllocateError, Allocation, Coding, Shape, uniform};
 use crate::codec::{BrickRange, Codec, SequenceRange, Texels, decode, encode};
 use crate::settings::{Clustering, RangeMode};
 use crate::stages::dedup::{SequenceTree, carried};
-use crate::volume::{BRICK_VOXELS, Brick, Mask512};
-
-/// Bricks that are read at a time.
-const BRICKS_IN_FLIGHT: usize = 4096;
+use crate::volume::{BRICK_VOXELS, BRICKS_IN_FLIGHT, Brick, Mask512, ValueRange};
 
 /// Gives every brick of `tree` one codec, and clusters those of little variance. The voxels of those are in memory
 /// together: 2 KB a brick.
@@ -28,12 +25,11 @@ pub fn clustered(
     let mut allocation = uniform(tree, codec, mode).ok_or(AllocateError::TooWide { grid: 0 })?;
     let sequence = allocation.sequence;
     let (mut ids, mut points) = (Vec::new(), Vec::new());
-    let all: Vec<u32> = (0..tree.pool.len()).collect();
     let mut bricks = Vec::new();
-    for window in all.chunks(BRICKS_IN_FLIGHT) {
+    for first in (0..tree.pool.len()).step_by(BRICKS_IN_FLIGHT as usize) {
         bricks.clear();
-        tree.pool.read_each(window, &mut bricks)?;
-        for (&id, brick) in window.iter().zip(&bricks) {
+        tree.pool.read(first..(first + BRICKS_IN_FLIGHT).min(tree.pool.len()), &mut bricks)?;
+        for (id, brick) in (first..).zip(&bricks) {
             if variance(brick) <= clustering.variance {
                 ids.push(id);
                 points.extend(brick.values.iter().map(|v| fraction(&sequence, *v)));
@@ -73,19 +69,18 @@ pub fn clustered(
     let ranges: Vec<BrickRange> = decoded
         .iter()
         .zip(&centroids)
-        .map(
-            |(values, texels)| if codec.is_normalised() { texels.range } else { fit(&sequence, &values[..]) },
-        )
+        .map(|(values, texels)| if codec.is_normalised() { texels.range } else { fit(&sequence, values) })
         .collect();
 
     let rules = tree.brick_rules();
-    for (ids, members) in ids.chunks(BRICKS_IN_FLIGHT).zip(found.members.chunks(BRICKS_IN_FLIGHT)) {
+    for (ids, members) in
+        ids.chunks(BRICKS_IN_FLIGHT as usize).zip(found.members.chunks(BRICKS_IN_FLIGHT as usize))
+    {
         bricks.clear();
         tree.pool.read_each(ids, &mut bricks)?;
         for ((&id, &member), brick) in ids.iter().zip(members).zip(&bricks) {
-            let (id, values) = (id as usize, &decoded[member as usize]);
-            let square = |i: usize| (f64::from(values[i]) - f64::from(brick.values[i])).powi(2);
-            allocation.norms[id] = carried(brick, rules[id]).ones().map(square).sum::<f64>().sqrt();
+            let id = id as usize;
+            allocation.norms[id] = brick.error_norm(&decoded[member as usize], &carried(brick, rules[id]));
             allocation.codings[id] = Coding::Shared(member);
             allocation.ranges[id] = ranges[member as usize];
         }
@@ -95,10 +90,9 @@ pub fn clustered(
 
 /// The variance of a brick's values once they are stretched to 0..1: so a faint brick counts as a dense one does.
 fn variance(brick: &Brick) -> f64 {
-    let values = || brick.values.iter().map(|v| f64::from(*v));
-    let (min, max) = (values().fold(f64::INFINITY, f64::min), values().fold(f64::NEG_INFINITY, f64::max));
-    let extent = if max > min { max - min } else { 1.0 };
-    let stretched = || values().map(|v| (v - min) / extent);
+    let range = range(&brick.values);
+    let extent = if range.width() > 0.0 { range.width() } else { 1.0 };
+    let stretched = || brick.values.iter().map(|v| (f64::from(*v) - f64::from(range.min)) / extent);
     let mean = stretched().sum::<f64>() / BRICK_VOXELS as f64;
     stretched().map(|v| (v - mean).powi(2)).sum::<f64>() / BRICK_VOXELS as f64
 }
@@ -119,9 +113,12 @@ fn texels(sequence: &SequenceRange, mode: RangeMode, centroid: &[f32]) -> Texels
     Texels { values, carried: Mask512::ALL, range }
 }
 
-/// The tightest range around some values.
-fn fit(sequence: &SequenceRange, values: &[f32]) -> BrickRange {
-    let (min, max) =
-        values.iter().fold((f32::INFINITY, f32::NEG_INFINITY), |(a, b), v| (a.min(*v), b.max(*v)));
-    sequence.fit(min, max)
+/// The tightest brick range around some values.
+fn fit(sequence: &SequenceRange, values: &[f32; BRICK_VOXELS]) -> BrickRange {
+    let range = range(values);
+    sequence.fit(range.min, range.max)
+}
+
+fn range(values: &[f32; BRICK_VOXELS]) -> ValueRange {
+    ValueRange::union_all(values.iter().copied().map(ValueRange::of)).expect("a brick has values")
 }

@@ -15,6 +15,7 @@ use super::share::{Loan, loans};
 use super::trial::{Cost, Rung, Trials};
 use super::{Allocation, Coding, Shape};
 use crate::stages::dedup::{Payload, SequenceTree};
+use crate::volume::ValueRange;
 
 /// A step is 1.1 % of λ, under 0.05 dB of PSNR.
 const STEPS_PER_OCTAVE: u32 = 64;
@@ -71,7 +72,7 @@ impl<'a> GridSearch<'a> {
                 records[id as usize] += 1;
             }
         }
-        let peak = tree.active_range().map_or(0.0, |r| f64::from(r.max) - f64::from(r.min));
+        let peak = tree.active_range().map_or(0.0, ValueRange::width);
         Self {
             least_step: vec![0; uses.len()],
             loans: vec![None; uses.len()],

@@ -2,8 +2,8 @@
 //!
 //! Two bricks of the same shape differ by a minimum and an extent, which every record has of its own. So a brick whose
 //! shape another's texels have already can do without texels: gain-shape vector quantisation (Gersho & Gray 1992, 12.10)
-//! with the coded bricks themselves for a codebook, which costs no bit and needs no training. A learned codebook of 128
-//! shapes was within 2 % of it (docs/decisions/0008-borrowed-texels.md).
+//! with the coded bricks themselves for a codebook, which costs no bit and needs no training (a learned one was tried too:
+//! docs/decisions/0008-borrowed-texels.md).
 
 use std::io;
 

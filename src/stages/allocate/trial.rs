@@ -8,10 +8,7 @@ use rayon::prelude::*;
 
 use crate::codec::{BATCH, BrickRange, Codec, SequenceRange, Texels, decode, encode, spread};
 use crate::stages::dedup::{SequenceTree, carried};
-use crate::volume::{BRICK_VOXELS, Brick, InactiveRule, Mask512};
-
-/// Bricks that are in memory at once: 8 MB of voxels, enough batches for every core.
-const BRICKS_IN_FLIGHT: usize = 4096;
+use crate::volume::{BRICK_VOXELS, BRICKS_IN_FLIGHT, Brick, InactiveRule, Mask512};
 
 /// The ways to code a brick.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -117,9 +114,9 @@ impl Trials {
             ranges,
         };
         let mut bricks = Vec::new();
-        for first in (0..tree.pool.len()).step_by(BRICKS_IN_FLIGHT) {
+        for first in (0..tree.pool.len()).step_by(BRICKS_IN_FLIGHT as usize) {
             bricks.clear();
-            tree.pool.read(first..(first + BRICKS_IN_FLIGHT as u32).min(tree.pool.len()), &mut bricks)?;
+            tree.pool.read(first..(first + BRICKS_IN_FLIGHT).min(tree.pool.len()), &mut bricks)?;
             let tried: Vec<(f32, [Cost; LOSSY])> = bricks
                 .par_chunks(BATCH)
                 .enumerate()
@@ -267,7 +264,7 @@ impl Trials {
         mut advance: impl FnMut(u64),
     ) -> io::Result<()> {
         let mut bricks = Vec::new();
-        for ids in ids.chunks(BRICKS_IN_FLIGHT) {
+        for ids in ids.chunks(BRICKS_IN_FLIGHT as usize) {
             bricks.clear();
             tree.pool.read_each(ids, &mut bricks)?;
             let batches = bricks.par_chunks(BATCH).zip(ids.par_chunks(BATCH));
