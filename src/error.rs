@@ -70,10 +70,13 @@ pub enum Error {
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
 impl Error {
-    /// Wraps what the operating system said of `path`.
+    /// Wraps what the operating system said of `path`. An error of ours that a reader carried inside comes out again.
     pub fn io(path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.into();
-        move |source| Self::Io { path, source }
+        move |source| match source.downcast::<Self>() {
+            Ok(ours) => ours,
+            Err(source) => Self::Io { path, source },
+        }
     }
 
     /// Wraps what is wrong with the OpenVDB file at `path`.

@@ -14,6 +14,7 @@
 //! - [`codec`] knows how one brick becomes texels and what a GPU reads from them.
 //! - [`pack`] is the file format: writer, reader, checks, decoder.
 //! - [`pipeline`] strings the stages together, [`manifest`] says with what [`settings`].
+//! - [`cache`] keeps what stages made, so that the second build is instant.
 //! - [`verify`] compares a finished pack with its source, [`report`] puts files into figures.
 //! - [`render`] traces pictures of packs and sources, on the CPU and through wgpu.
 //! - [`sweep`] measures many settings side by side, and how steady each is.
@@ -32,6 +33,7 @@
 //! # Ok::<(), volpack::error::Error>(())
 //! ```
 
+pub mod cache;
 pub mod cli;
 pub mod codec;
 pub mod error;

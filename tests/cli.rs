@@ -9,7 +9,10 @@ use common::fixture;
 use serde_json::Value as Json;
 
 fn volpack(folder: &Path, args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_volpack")).current_dir(folder).args(args).output().unwrap()
+    // A cache of its own: not the user's, and nothing in it.
+    let cache = tempfile::tempdir().unwrap();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_volpack"));
+    command.env("VOLPACK_CACHE", cache.path()).current_dir(folder).args(args).output().unwrap()
 }
 
 fn stdout(output: &Output) -> String {

@@ -6,12 +6,13 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use serde_json::{Value as Json, json};
 
+use super::cache::CacheChoice;
 use super::progress::Reporter;
 use super::style::{self, GOOD, TITLE};
 use super::{Common, SettingsArgs, VerifyArg, outln, print_json};
 use crate::error::{Error, Result};
 use crate::manifest::{DEFAULT_NAME, Manifest, expand};
-use crate::pipeline::{Job, Outcome, build};
+use crate::pipeline::{Job, Made, Outcome, build};
 
 #[derive(Args)]
 pub struct BuildArgs {
@@ -34,6 +35,8 @@ pub struct BuildArgs {
     /// Make warnings errors: a missing frame, a grid that some frames lack
     #[arg(long)]
     strict: bool,
+    #[command(flatten)]
+    cache: CacheChoice,
     /// Print what was built as JSON
     #[arg(long)]
     json: bool,
@@ -73,6 +76,8 @@ fn build_one(name: &str, job: &Job, args: &BuildArgs, common: Common, asset: &mu
     asset["seconds"] = seconds.collect();
     asset["pack"] = json!(outcome.summary);
     asset["verification"] = json!(outcome.verification);
+    asset["made"] = json!(outcome.made);
+    asset["cache"] = json!(outcome.cache);
     match &outcome.verification {
         Some(report) => super::verify::verdict(&job.output, report).map_err(|e| {
             Error::Verify(format!("{e}\n  It was not written; --verify none writes it all the same."))
@@ -84,6 +89,7 @@ fn build_one(name: &str, job: &Job, args: &BuildArgs, common: Common, asset: &mu
 /// The packs that the arguments ask for, with the names to show.
 /// One whose files cannot be found is an error of its own.
 fn jobs(args: &BuildArgs) -> Result<Vec<(String, Result<Job>)>> {
+    let cache = args.cache.open();
     let job = |frames, output: &Path, settings, max_flip| Job {
         frames,
         output: output.to_owned(),
@@ -91,6 +97,8 @@ fn jobs(args: &BuildArgs) -> Result<Vec<(String, Result<Job>)>> {
         strict: args.strict,
         verify: args.verify.verify,
         pictures: args.verify.pictures.settings(max_flip),
+        cache: cache.clone(),
+        paranoid: args.cache.paranoid,
     };
     if !args.frames.is_empty() {
         let output = args
@@ -151,8 +159,16 @@ fn print(name: &str, job: &Job, outcome: &Outcome, verbose: bool) {
         for (stage, seconds) in &outcome.seconds {
             outln!("  {stage:22} {seconds:8.3} s");
         }
-    } else {
-        let total: f64 = outcome.seconds.iter().map(|(_, s)| s).sum();
-        outln!("  {GOOD}done{GOOD:#} in {}", style::seconds(total));
+        for (stage, uses) in &outcome.cache {
+            outln!("  {stage:22} {} of {} from the cache", uses.hits, uses.hits + uses.misses);
+        }
     }
+    let total: f64 = outcome.seconds.iter().map(|(_, s)| s).sum();
+    let how = match outcome.made {
+        Made::Built => "done",
+        Made::Repacked => "packed anew from the cache",
+        Made::Copied => "taken from the cache",
+        Made::Unchanged => "nothing changed: looked at",
+    };
+    outln!("  {GOOD}{how}{GOOD:#} in {}", style::seconds(total));
 }

@@ -1,6 +1,7 @@
 //! The command line: one file a subcommand.
 
 mod build;
+mod cache;
 mod init;
 mod inspect;
 mod progress;
@@ -59,6 +60,8 @@ struct Common {
 enum Command {
     /// Build packs from a manifest, or one pack from files
     Build(build::BuildArgs),
+    /// Look after what builds keep
+    Cache(cache::Arguments),
     /// Find the sequences in a folder and write a manifest for them
     Init(init::InitArgs),
     /// Say what is in a .vdb or a .volpack
@@ -186,6 +189,7 @@ pub fn run(cli: Cli) -> Result<()> {
     }
     match cli.command {
         Command::Build(args) => build::run(&args, cli.common),
+        Command::Cache(args) => cache::run(&args, cli.common),
         Command::Init(args) => init::run(&args, cli.common),
         Command::Inspect(args) => inspect::run(&args),
         Command::Verify(args) => verify::run(&args, cli.common),

@@ -116,6 +116,19 @@ pub mod encoding {
     /// The same for 4-byte words.
     pub const ZSTD_SHUFFLE_4: u32 = 3;
 
+    /// How a section is stored in a pack that uses zstd, or does not.
+    pub fn of(kind: u32, codec: u32, zstd: bool) -> u32 {
+        use crate::codec::Codec;
+        match (kind, Codec::from_tag(codec)) {
+            _ if !zstd => RAW,
+            // So short that they stay readable in a hex dump.
+            (super::kind::GRIDS | super::kind::NAMES | super::kind::ATLASES, _) => RAW,
+            (super::kind::TEXELS, Some(Codec::F16)) => ZSTD_SHUFFLE_2,
+            (super::kind::TEXELS, Some(Codec::F32)) => ZSTD_SHUFFLE_4,
+            _ => ZSTD,
+        }
+    }
+
     /// Bytes of the words whose bytes are gathered; 1 for none.
     pub fn shuffle_width(encoding: u32) -> usize {
         match encoding {

@@ -21,6 +21,16 @@ pub struct Provenance {
     pub sources: Vec<Source>,
 }
 
+impl Provenance {
+    /// The section's bytes.
+    ///
+    /// # Errors
+    /// When a number in the settings is not one that JSON has.
+    pub fn to_json(&self) -> std::io::Result<Vec<u8>> {
+        Ok(serde_json::to_vec_pretty(self)?)
+    }
+}
+
 /// One source file.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Source {

@@ -40,7 +40,7 @@ pub struct Pack {
     pub atlases: Vec<Atlas>,
     /// Where the pack comes from.
     pub provenance: Provenance,
-    sections: Vec<Section>,
+    pub(super) sections: Vec<Section>,
     chunks: Vec<Chunk>,
     /// The texel section's place for each of `atlases`.
     texel_sections: Vec<usize>,
@@ -265,7 +265,8 @@ impl Pack {
         Ok(pod_collect_to_vec(&raw))
     }
 
-    fn chunk(&self, section: &Section, index: usize) -> Result<Cow<'_, [u8]>, PackError> {
+    /// A chunk's bytes as they were before they were packed.
+    pub(super) fn chunk(&self, section: &Section, index: usize) -> Result<Cow<'_, [u8]>, PackError> {
         let chunk = &self.chunks[index];
         let stored = &self.bytes[chunk.offset as usize..][..chunk.stored_bytes as usize];
         if !self.checked[index].load(Ordering::Relaxed) {

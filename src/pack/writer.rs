@@ -78,12 +78,7 @@ impl PackWriter {
     /// # Errors
     /// When no file can be made beside `path`.
     pub fn create(path: &Path, specs: Vec<SectionSpec>) -> io::Result<Self> {
-        let folder = match path.parent() {
-            Some(folder) if folder != Path::new("") => folder,
-            _ => Path::new("."),
-        };
-        std::fs::create_dir_all(folder)?;
-        let file = tempfile::Builder::new().prefix(".volpack-").tempfile_in(folder)?;
+        let file = beside(path)?;
         let chunk_total = specs.iter().map(|s| s.raw_bytes.div_ceil(s.chunk_bytes.into()) as usize).sum();
         let tables =
             size_of::<Header>() + specs.len() * size_of::<Section>() + chunk_total * size_of::<Chunk>();
@@ -201,6 +196,16 @@ impl PackWriter {
     }
 }
 
+/// A new file in the folder of `path`, which is made if need be.
+fn beside(path: &Path) -> io::Result<NamedTempFile> {
+    let folder = match path.parent() {
+        Some(folder) if folder != Path::new("") => folder,
+        _ => Path::new("."),
+    };
+    std::fs::create_dir_all(folder)?;
+    tempfile::Builder::new().prefix(".volpack-").tempfile_in(folder)
+}
+
 /// A pack that is whole and lies beside its final place. It is gone if it is dropped.
 pub struct FinishedPack {
     file: NamedTempFile,
@@ -208,6 +213,20 @@ pub struct FinishedPack {
 }
 
 impl FinishedPack {
+    /// One that `fill` writes, which says whether it could.
+    ///
+    /// # Errors
+    /// When no file can be made beside `path`, or `fill` fails.
+    pub fn filled(path: &Path, fill: impl FnOnce(&mut File) -> io::Result<bool>) -> io::Result<Option<Self>> {
+        let mut file = beside(path)?;
+        if !fill(file.as_file_mut())? {
+            return Ok(None);
+        }
+        file.as_file().sync_all()?;
+        make_readable(file.as_file())?;
+        Ok(Some(Self { file, path: path.to_owned() }))
+    }
+
     /// Where it lies for now.
     pub fn path(&self) -> &Path {
         self.file.path()

@@ -1,6 +1,7 @@
 //! Chooses between the tracers.
 
 use clap::ValueEnum;
+use serde::Serialize;
 
 use super::cpu::{Scene, trace};
 use super::field::Field;
@@ -9,7 +10,7 @@ use super::image::Image;
 use crate::pack::{FrameReader, Pack};
 
 /// What traces a picture.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, ValueEnum)]
 pub enum Device {
     /// A GPU or software Vulkan where one answers, else the CPU
     #[default]

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
+use crate::cache::{Cache, Stamp};
 use crate::error::{Error, Result};
 use crate::vdb::{GridInfo, VdbFile};
 
@@ -17,8 +18,8 @@ pub struct FrameSource {
     pub number: i32,
     /// BLAKE3 of its bytes.
     pub digest: blake3::Hash,
-    /// Its length in bytes.
-    pub bytes: u64,
+    /// What tells whether it is still the file that it was.
+    pub stamp: Stamp,
     /// The grids in it.
     pub grids: Vec<GridInfo>,
 }
@@ -27,6 +28,20 @@ impl FrameSource {
     /// The file's name without its folder, as it goes into a pack.
     pub fn file_name(&self) -> String {
         file_name(&self.path)
+    }
+
+    /// Nothing that was read of a file counts if it changed meanwhile.
+    ///
+    /// # Errors
+    /// When it did.
+    pub fn check_unchanged(&self) -> Result<()> {
+        match Stamp::of(&self.path).map_err(Error::io(&self.path))? == self.stamp {
+            true => Ok(()),
+            false => Err(Error::Input(format!(
+                "{}: the file changed while it was being read: build again when it is complete",
+                self.path.display()
+            ))),
+        }
     }
 }
 
@@ -39,11 +54,20 @@ pub struct SequenceInfo {
     pub warnings: Vec<String>,
 }
 
+/// Where the digests of sources come from.
+#[derive(Clone, Copy, Default)]
+pub struct Digests<'a> {
+    /// What remembers them.
+    pub cache: Option<&'a Cache>,
+    /// Whether files that seem unchanged are hashed all the same.
+    pub paranoid: bool,
+}
+
 /// Reads the metadata of every file and orders the files by frame number.
 ///
 /// # Errors
 /// The first file, in the given order, that cannot be read; two files of one frame.
-pub fn read(paths: &[PathBuf]) -> Result<SequenceInfo> {
+pub fn read(paths: &[PathBuf], digests: Digests) -> Result<SequenceInfo> {
     if paths.is_empty() {
         return Err(Error::Input("there are no frames to read".to_owned()));
     }
@@ -52,7 +76,7 @@ pub fn read(paths: &[PathBuf]) -> Result<SequenceInfo> {
     let mut frames = paths
         .par_iter()
         .zip(numbers)
-        .map(|(path, number)| read_one(path, number))
+        .map(|(path, number)| read_one(path, number, digests))
         .collect::<Vec<_>>()
         .into_iter()
         .collect::<Result<Vec<_>>>()?;
@@ -70,10 +94,26 @@ pub fn read(paths: &[PathBuf]) -> Result<SequenceInfo> {
     Ok(SequenceInfo { frames, warnings })
 }
 
-fn read_one(path: &Path, number: i32) -> Result<FrameSource> {
+fn read_one(path: &Path, number: i32, digests: Digests) -> Result<FrameSource> {
+    let stamp = Stamp::of(path).map_err(Error::io(path))?;
     let file = VdbFile::open(path).map_err(Error::vdb(path))?;
-    let (digest, bytes) = digest(path)?;
-    Ok(FrameSource { path: path.to_owned(), number, digest, bytes, grids: file.grids })
+    let digest = digests.of(path, &stamp)?;
+    Ok(FrameSource { path: path.to_owned(), number, digest, stamp, grids: file.grids })
+}
+
+impl Digests<'_> {
+    /// The digest of a file with this stamp.
+    fn of(self, path: &Path, stamp: &Stamp) -> Result<blake3::Hash> {
+        let remembered = self.cache.filter(|_| !self.paranoid).and_then(|c| c.remembered(path, stamp));
+        if let Some(digest) = remembered {
+            return Ok(digest);
+        }
+        let (digest, _) = digest(path)?;
+        if let Some(cache) = self.cache {
+            cache.remember(path, stamp, &digest);
+        }
+        Ok(digest)
+    }
 }
 
 /// BLAKE3 of a file's bytes, and how many there are.

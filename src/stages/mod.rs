@@ -13,6 +13,7 @@
 
 pub mod allocate;
 pub mod dedup;
+pub mod encodings;
 pub mod flatten;
 pub mod metadata;
 pub mod quantise;

@@ -5,10 +5,11 @@ use std::io;
 use rayon::prelude::*;
 
 use super::allocate::{Allocation, Coding};
-use super::dedup::{SequenceTree, carried};
+use super::dedup::SequenceTree;
+use super::encodings::{KeptCodec, Kind};
 use super::relayout::{self, PlannedAtlas, Texture, TextureOf};
 use crate::codec::{Codec, OutOfRange, Texels, decode, encode};
-use crate::volume::{BRICKS_IN_FLIGHT, Brick, InactiveRule};
+use crate::volume::{BRICKS_IN_FLIGHT, Brick};
 
 /// One grid's bricks and how they are coded.
 pub struct GridBricks<'a> {
@@ -55,10 +56,10 @@ impl Outcome {
 
 /// The contents of some slots before they are encoded.
 enum Run {
-    /// One slot's bytes, which are there already, and their packing axis.
-    Encoded(Vec<u8>, u8),
-    /// Bricks of one grid that follow each other in its pool, from this one on.
-    Bricks(u32, Vec<Brick>),
+    /// One slot's texels, which are there already.
+    Encoded(Encoded),
+    /// Bricks of one grid, by their numbers in its pool.
+    Bricks(Vec<u32>, Vec<Brick>),
 }
 
 /// One brick's texels, encoded.
@@ -82,13 +83,13 @@ pub fn quantise<T: Send>(
     mut sink: impl FnMut(T) -> io::Result<()>,
 ) -> Result<(), QuantiseError> {
     let atlas = &planned.atlas;
-    let rules: Vec<Vec<InactiveRule>> = grids.iter().map(|g| g.tree.brick_rules()).collect();
     let group = (BRICKS_IN_FLIGHT / atlas.slab_bricks()).max(1);
     for first in (0..atlas.slabs).step_by(group as usize) {
         let slabs: Vec<&[Texture]> = (first..(first + group).min(atlas.slabs))
             .map(|slab| atlas.slots(slab))
             .map(|slots| &planned.texels[slots.start as usize..slots.end as usize])
             .collect();
+        make_kept(grids, atlas.codec, &slabs.concat())?;
         let runs = slabs
             .iter()
             .map(|textures| read_runs(grids, atlas.codec, textures))
@@ -97,7 +98,7 @@ pub fn quantise<T: Send>(
         let encoded: Vec<_> = runs
             .into_par_iter()
             .map(|runs| {
-                let encoded = encode_slab(atlas.codec, grids, &rules, runs)?;
+                let encoded = encode_slab(atlas.codec, grids, runs)?;
                 let bytes: Vec<u8> = encoded.iter().flat_map(|e| &e.bytes).copied().collect();
                 Ok((finish(relayout::assemble(atlas, &bytes))?, encoded))
             })
@@ -116,36 +117,52 @@ pub fn quantise<T: Send>(
     Ok(())
 }
 
-/// What lies in some slots, each run with its grid: bytes where they are known, else bricks.
+/// Makes the texels of some slots that are kept and not there yet.
+fn make_kept(grids: &mut [GridBricks], codec: Codec, textures: &[Texture]) -> io::Result<()> {
+    let Some(kept) = KeptCodec::of(codec) else { return Ok(()) };
+    for (g, GridBricks { tree, allocation }) in grids.iter_mut().enumerate() {
+        let own = |texture: &Texture| match texture.of {
+            TextureOf::Brick(id) => (texture.grid as usize == g).then_some(id),
+            TextureOf::Shape(_) => None,
+        };
+        let ids: Vec<u32> = textures.iter().filter_map(own).collect();
+        allocation.encodings.make(tree, &ids, &[Kind::Texels(kept)], |_| ())?;
+    }
+    Ok(())
+}
+
+/// What lies in some slots, each run with its grid: texels where they are known, else bricks.
 fn read_runs(grids: &mut [GridBricks], codec: Codec, textures: &[Texture]) -> io::Result<Vec<(usize, Run)>> {
-    let follows = |a: &Texture, b: &Texture| match (a.of, b.of) {
-        (TextureOf::Brick(first), TextureOf::Brick(second)) => a.grid == b.grid && first + 1 == second,
-        _ => false,
+    let together = |a: &Texture, b: &Texture| {
+        a.grid == b.grid && matches!((a.of, b.of), (TextureOf::Brick(_), TextureOf::Brick(_)))
     };
     let mut runs = Vec::new();
-    for run in textures.chunk_by(follows) {
+    for run in textures.chunk_by(together) {
         let index = run[0].grid as usize;
         let GridBricks { tree, allocation } = &mut grids[index];
-        let first = match run[0].of {
-            TextureOf::Brick(first) => first,
-            TextureOf::Shape(shape) => {
-                let shape = &allocation.shapes[shape as usize];
-                runs.push((index, Run::Encoded(shape.bytes.clone(), shape.axis)));
-                continue;
-            }
+        if let TextureOf::Shape(shape) = run[0].of {
+            let shape = &allocation.shapes[shape as usize];
+            let encoded = Encoded { bytes: shape.bytes.clone(), axis: shape.axis, norm: None };
+            runs.push((index, Run::Encoded(encoded)));
+            continue;
+        }
+        let id = |texture: &Texture| match texture.of {
+            TextureOf::Brick(id) => id,
+            TextureOf::Shape(_) => unreachable!("shapes are runs of their own"),
         };
-        let ids = first..first + run.len() as u32;
-        match allocation.kept.as_mut().filter(|kept| kept.holds(codec)) {
+        let ids: Vec<u32> = run.iter().map(id).collect();
+        match KeptCodec::of(codec) {
             Some(kept) => {
-                for id in ids {
-                    let (bytes, axis) = kept.get(id)?;
-                    runs.push((index, Run::Encoded(bytes, axis)));
-                }
+                let texels = allocation.encodings.texels(&ids, kept)?;
+                runs.extend(ids.iter().zip(texels).map(|(&id, (bytes, axis))| {
+                    let norm = allocation.encodings.cost(id, kept).map(|cost| cost.norm);
+                    (index, Run::Encoded(Encoded { bytes, axis, norm }))
+                }));
             }
             None => {
                 let mut bricks = Vec::with_capacity(ids.len());
-                tree.pool.read(ids, &mut bricks)?;
-                runs.push((index, Run::Bricks(first, bricks)));
+                tree.read(&ids, &mut bricks)?;
+                runs.push((index, Run::Bricks(ids, bricks)));
             }
         }
     }
@@ -155,15 +172,14 @@ fn read_runs(grids: &mut [GridBricks], codec: Codec, textures: &[Texture]) -> io
 fn encode_slab(
     codec: Codec,
     grids: &[GridBricks],
-    rules: &[Vec<InactiveRule>],
     runs: Vec<(usize, Run)>,
 ) -> Result<Vec<Encoded>, QuantiseError> {
     let mut out = Vec::new();
     for (grid, run) in runs {
         match run {
-            Run::Encoded(bytes, axis) => out.push(Encoded { bytes, axis, norm: None }),
-            Run::Bricks(first, bricks) => out.extend(
-                encode_bricks(codec, &grids[grid], &rules[grid], first, &bricks)
+            Run::Encoded(encoded) => out.push(encoded),
+            Run::Bricks(ids, bricks) => out.extend(
+                encode_bricks(codec, &grids[grid], &ids, &bricks)
                     .map_err(|source| QuantiseError::OutOfRange { grid, source })?,
             ),
         }
@@ -174,19 +190,13 @@ fn encode_slab(
 fn encode_bricks(
     codec: Codec,
     grid: &GridBricks,
-    rules: &[InactiveRule],
-    first: u32,
+    ids: &[u32],
     bricks: &[Brick],
 ) -> Result<Vec<Encoded>, OutOfRange> {
     let sequence = &grid.allocation.sequence;
-    let texels: Vec<Texels> = bricks
-        .iter()
-        .zip(first as usize..)
-        .map(|(brick, id)| {
-            let (carried, range) = (carried(brick, rules[id]), grid.tree.brick_ranges[id]);
-            Texels::new(brick, carried, (range.min, range.max), grid.allocation.ranges[id])
-        })
-        .collect();
+    let encodings = &grid.allocation.encodings;
+    let texels: Vec<Texels> =
+        ids.iter().zip(bricks).map(|(&id, brick)| encodings.prepare(grid.tree, id, brick)).collect();
     let encoded = encode(codec, sequence, &texels)?;
     let size = codec.layout().brick_bytes();
     let each = bricks.iter().zip(&texels).zip(encoded.bytes.chunks_exact(size)).zip(encoded.axes);

@@ -75,7 +75,8 @@ struct Source {
 
 impl Source {
     fn read(options: &Options) -> Result<Self> {
-        let sequence = crate::stages::metadata::read(&options.frames)?;
+        let sequence =
+            crate::stages::metadata::read(&options.frames, crate::stages::metadata::Digests::default())?;
         let grids: Vec<String> = options.grid.iter().cloned().collect();
         let selection = crate::stages::select::select(&sequence, &grids)?;
         let grid = selection.grids[0].name.clone();

@@ -67,7 +67,10 @@ fn variations(options: &Options, method: &Method) -> Vec<Variation> {
 pub fn stability(options: &Options, methods: &[Method], progress: &mut dyn Progress) -> Result<Stability> {
     let scratch = tempfile::tempdir().map_err(Error::io(std::env::temp_dir()))?;
     // A grid that is not there is an error of the whole, not of each method.
-    select(&metadata::read(&options.frames)?, &options.grid.iter().cloned().collect::<Vec<_>>())?;
+    select(
+        &metadata::read(&options.frames, metadata::Digests::default())?,
+        &options.grid.iter().cloned().collect::<Vec<_>>(),
+    )?;
     let (spreads, skipped) = each(methods, progress, |method| spread(options, method, scratch.path()))?;
     Ok(Stability { spreads, skipped })
 }

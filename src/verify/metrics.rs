@@ -1,6 +1,6 @@
 //! Errors as people and machines read them.
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::PicturesReport;
 use super::compare::{Error, FrameError};
@@ -9,7 +9,7 @@ use crate::settings::{FRAME_MARGIN_DB, Format, Quality};
 use crate::volume::ValueRange;
 
 /// How far decoded values are from the source's.
-#[derive(Clone, Copy, Debug, Serialize)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Metrics {
     /// Voxels compared.
     pub voxels: u64,
@@ -25,7 +25,7 @@ pub struct Metrics {
 }
 
 /// One frame of one grid.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct FrameReport {
     /// The grid.
     pub grid: String,
@@ -38,7 +38,7 @@ pub struct FrameReport {
 }
 
 /// The frame with the lowest PSNR.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct WorstFrame {
     /// Its grid.
     pub grid: String,
@@ -49,7 +49,7 @@ pub struct WorstFrame {
 }
 
 /// One grid over all its frames.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct GridReport {
     /// Its name.
     pub grid: String,
@@ -62,7 +62,7 @@ pub struct GridReport {
 }
 
 /// What the voxel ring found.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct VerifyReport {
     /// Whether nothing failed.
     pub ok: bool,

@@ -6,7 +6,7 @@
 
 use std::path::{Path, PathBuf};
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::Sources;
 use crate::codec::Codec;
@@ -46,7 +46,7 @@ pub struct PictureSettings {
 }
 
 /// What the picture ring found.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct PicturesReport {
     /// What traced the pack for half (a); null where there is no GPU and no software Vulkan, and half (a)
     /// was left out.
@@ -62,7 +62,7 @@ pub struct PicturesReport {
 }
 
 /// One picture.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct PictureReport {
     /// The grid.
     pub grid: String,
@@ -75,7 +75,7 @@ pub struct PictureReport {
 }
 
 /// How far the wgpu tracer is from the CPU tracer.
-#[derive(Clone, Copy, Debug, Serialize)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct TracerDifference {
     /// Pixels that differ by more than the tolerance.
     pub pixels: u64,

@@ -1,5 +1,7 @@
 //! An 8³ block of voxels, and what its inactive voxels are.
 
+use serde::{Deserialize, Serialize};
+
 use super::Mask512;
 
 /// Voxels in a brick.
@@ -17,7 +19,7 @@ pub struct Brick {
 }
 
 /// What an inactive voxel under a mask reads as. The numbers are the pack's.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[repr(u8)]
 pub enum InactiveRule {
     /// The background.

@@ -61,7 +61,7 @@ impl Coord {
 }
 
 /// An inclusive box of voxels. Empty when any minimum is above its maximum.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct CoordBox {
     /// The smallest corner.
     pub min: Coord,

@@ -1,9 +1,11 @@
 //! One grid of one frame, flattened: constant regions and bricks by 128³ cell.
 
+use serde::{Deserialize, Serialize};
+
 use super::{BRICK_DIM, Brick, Coord, CoordBox};
 
 /// A region of one value.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Constant {
     /// The value of every voxel in it.
     pub value: f32,
@@ -19,7 +21,7 @@ impl Constant {
 }
 
 /// What stands at one of an L2 node's 4096 places.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub enum Child {
     /// A constant 8³ region.
     Constant(Constant),
@@ -28,7 +30,7 @@ pub enum Child {
 }
 
 /// What fills a 128³ cell.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub enum CellContent {
     /// One value.
     Constant(Constant),
@@ -38,7 +40,7 @@ pub enum CellContent {
 }
 
 /// A 128³ cell that is not all background.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Cell {
     /// Smallest corner, a multiple of 128.
     pub origin: Coord,
@@ -47,7 +49,7 @@ pub struct Cell {
 }
 
 /// A closed range of values.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct ValueRange {
     /// The smallest.
     pub min: f32,
@@ -78,7 +80,7 @@ impl ValueRange {
 }
 
 /// Counts of one frame, taken from the source before anything is simplified.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct FrameStats {
     /// Leaves of the source tree.
     pub leaves: u64,

@@ -1,7 +1,12 @@
 //! Bit masks, in OpenVDB's order: bit `n` of a brick is voxel `x << 6 | y << 3 | z`.
 
+use serde::{Deserialize, Serialize};
+
 /// One bit for each voxel of a brick.
-#[derive(Clone, Copy, PartialEq, Eq, Hash, bytemuck::Pod, bytemuck::Zeroable, Default)]
+#[derive(
+    Clone, Copy, PartialEq, Eq, Hash, bytemuck::Pod, bytemuck::Zeroable, Default, Serialize, Deserialize,
+)]
+#[serde(transparent)]
 #[repr(transparent)]
 pub struct Mask512(pub [u64; 8]);
 

@@ -1,31 +1,51 @@
 //! The unique bricks of a sequence: small records in memory, values in a scratch file.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::fs::File;
 use std::io::{self, BufWriter, Read, Seek, SeekFrom, Write};
 
-use xxhash_rust::xxh3::{Xxh3Default, xxh3_128};
+use xxhash_rust::xxh3::xxh3_128;
 
 use super::{BRICK_VOXELS, Brick, Mask512};
 
-/// Bytes of one brick in the scratch file: values, mask, and whether there is one.
-const SCRATCH_BRICK_BYTES: usize = BRICK_VOXELS * 4 + 64 + 1;
+/// Bytes of one brick in the scratch file.
+const SCRATCH_BRICK_BYTES: usize = BRICK_VOXELS * 4;
 
 /// Bricks that are read back at a time: 8 MB of voxels, enough batches of an encoder for every core.
 pub const BRICKS_IN_FLIGHT: u32 = 4096;
 
+/// Where a brick comes from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Home {
+    /// The frame that had it first, by its place among the frames that were added.
+    pub frame: u32,
+    /// Its place among that frame's bricks.
+    pub brick: u32,
+}
+
 /// Stores bricks so that equal ones are kept once, and gives them back by number.
 ///
-/// Memory is about 50 bytes a unique brick; the 2 KB of voxels go to an unnamed temporary file.
+/// A brick may be known before its values are: they are put in when someone has need of them. Memory is about 160
+/// bytes a unique brick; the 2 KB of voxels go to an unnamed temporary file.
 pub struct BrickPool {
-    by_hash: HashMap<u128, u32>,
-    /// The active voxels of bricks of which the scratch file has only the first one's.
-    widened: HashMap<u32, Mask512>,
+    by_hash: HashMap<[u8; 32], u32>,
+    bricks: Vec<Known>,
+    /// Bricks whose active voxels are those of several bricks of the source.
+    widened: HashSet<u32>,
     writer: BufWriter<File>,
     reader: File,
-    len: u32,
-    /// Bricks up to this number have reached the file and can be read back.
+    /// Bricks in the scratch file.
+    written: u32,
+    /// Those of them that have reached it and can be read back.
     flushed: u32,
+}
+
+struct Known {
+    active: Mask512,
+    keeps_mask: bool,
+    home: Home,
+    /// Its place in the scratch file.
+    slot: Option<u32>,
 }
 
 impl BrickPool {
@@ -35,106 +55,112 @@ impl BrickPool {
     /// When no temporary file can be made.
     pub fn new() -> io::Result<Self> {
         let file = tempfile::tempfile()?;
-        let reader = file.try_clone()?;
-        let writer = BufWriter::with_capacity(1 << 20, file);
-        Ok(Self { by_hash: HashMap::new(), widened: HashMap::new(), writer, reader, len: 0, flushed: 0 })
+        Ok(Self {
+            by_hash: HashMap::new(),
+            bricks: Vec::new(),
+            widened: HashSet::new(),
+            reader: file.try_clone()?,
+            writer: BufWriter::with_capacity(1 << 20, file),
+            written: 0,
+            flushed: 0,
+        })
     }
 
     /// How many unique bricks there are.
     pub fn len(&self) -> u32 {
-        self.len
+        self.bricks.len() as u32
     }
 
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
-        self.len == 0
+        self.bricks.is_empty()
     }
 
-    /// The hash that [`BrickPool::insert`] wants; separate so that it can be taken on many threads.
-    pub fn hash(brick: &Brick) -> u128 {
-        let mut hasher = Xxh3Default::new();
+    /// BLAKE3 of what makes a brick: its values, and its mask where that is kept. Two bricks of one digest are one:
+    /// nobody has ever found two texts of one.
+    pub fn digest(brick: &Brick) -> [u8; 32] {
+        let mut hasher = blake3::Hasher::new();
         hasher.update(bytemuck::bytes_of(&brick.values));
         if brick.keeps_mask {
             hasher.update(bytemuck::bytes_of(&brick.active));
         }
-        hasher.digest128()
+        hasher.finalize().into()
     }
 
-    /// The number of this brick, and whether it is new.
-    ///
-    /// # Errors
-    /// When the scratch file cannot be written or read back.
-    pub fn insert(&mut self, hash: u128, brick: &Brick) -> io::Result<(u32, bool)> {
-        if let Some(&id) = self.by_hash.get(&hash) {
-            // Equal hashes are compared: a collision costs a second copy, never a wrong voxel.
-            let known = self.get(id)?;
-            if known.same_bits(brick) {
-                if known.active != brick.active {
-                    // Without a kept mask bricks are one if their values are. The pool's counts as
-                    // active what is active in any of them.
-                    self.widened.insert(id, known.active.union(&brick.active));
-                }
-                return Ok((id, false));
-            }
+    /// The number of the brick with this digest, and whether it is new. Its values are still to be put in.
+    pub fn insert(
+        &mut self,
+        digest: &[u8; 32],
+        active: &Mask512,
+        keeps_mask: bool,
+        home: Home,
+    ) -> (u32, bool) {
+        let next = self.bricks.len() as u32;
+        let id = *self.by_hash.entry(*digest).or_insert(next);
+        if id == next {
+            self.bricks.push(Known { active: *active, keeps_mask, home, slot: None });
+            return (id, true);
         }
-        let id = self.len;
-        self.by_hash.entry(hash).or_insert(id);
-        self.writer.write_all(bytemuck::bytes_of(&brick.values))?;
-        self.writer.write_all(bytemuck::bytes_of(&brick.active))?;
-        self.writer.write_all(&[u8::from(brick.keeps_mask)])?;
-        self.len += 1;
-        Ok((id, true))
-    }
-
-    fn get(&mut self, id: u32) -> io::Result<Brick> {
-        let mut one = Vec::with_capacity(1);
-        self.read(id..id + 1, &mut one)?;
-        Ok(one.pop().expect("one brick was read"))
-    }
-
-    /// Appends the bricks of some numbers, ascending, to `out`.
-    ///
-    /// # Errors
-    /// When the scratch file cannot be read back.
-    pub fn read_each(&mut self, ids: &[u32], out: &mut Vec<Brick>) -> io::Result<()> {
-        ids.chunk_by(|a, b| a + 1 == *b).try_for_each(|run| self.read(run[0]..run[0] + run.len() as u32, out))
-    }
-
-    /// Appends the bricks of a range of numbers to `out`.
-    ///
-    /// # Errors
-    /// When the scratch file cannot be read back.
-    pub fn read(&mut self, ids: std::ops::Range<u32>, out: &mut Vec<Brick>) -> io::Result<()> {
-        if ids.end > self.flushed {
-            self.writer.flush()?;
-            self.flushed = self.len;
+        let known = &mut self.bricks[id as usize];
+        if known.active != *active {
+            // Without a kept mask bricks are one if their values are. The pool's counts as active what is
+            // active in any of them.
+            known.active = known.active.union(active);
+            self.widened.insert(id);
         }
-        let mut bytes = vec![0; ids.len() * SCRATCH_BRICK_BYTES];
-        // Reader and writer share one file position.
-        self.reader.seek(SeekFrom::Start(u64::from(ids.start) * SCRATCH_BRICK_BYTES as u64))?;
-        self.reader.read_exact(&mut bytes)?;
-        self.reader.seek(SeekFrom::End(0))?;
-        out.extend(bytes.chunks_exact(SCRATCH_BRICK_BYTES).zip(ids).map(|(b, id)| {
-            let (values, rest) = b.split_at(BRICK_VOXELS * 4);
-            let widened = self.widened.get(&id).copied();
-            Brick {
-                values: bytemuck::pod_read_unaligned(values),
-                active: widened.unwrap_or_else(|| bytemuck::pod_read_unaligned(&rest[..64])),
-                keeps_mask: rest[64] != 0,
-            }
-        }));
+        (id, false)
+    }
+
+    /// Where a brick comes from.
+    pub fn home(&self, id: u32) -> Home {
+        self.bricks[id as usize].home
+    }
+
+    /// Whether a brick's active voxels are those of several bricks of the source.
+    pub fn is_widened(&self, id: u32) -> bool {
+        self.widened.contains(&id)
+    }
+
+    /// Whether a brick's values were put in.
+    pub fn is_there(&self, id: u32) -> bool {
+        self.bricks[id as usize].slot.is_some()
+    }
+
+    /// Puts a brick's values in.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be written.
+    pub fn put(&mut self, id: u32, values: &[f32; BRICK_VOXELS]) -> io::Result<()> {
+        self.writer.write_all(bytemuck::bytes_of(values))?;
+        self.bricks[id as usize].slot = Some(self.written);
+        self.written += 1;
         Ok(())
     }
-}
 
-impl Brick {
-    fn same_bits(&self, other: &Self) -> bool {
-        bytemuck::bytes_of(&self.values) == bytemuck::bytes_of(&other.values)
-            && self.keeps_mask == other.keeps_mask
-            && (!self.keeps_mask || self.active == other.active)
+    /// Appends some bricks, whose values are there, to `out`.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be read back.
+    pub fn read(&mut self, ids: &[u32], out: &mut Vec<Brick>) -> io::Result<()> {
+        if self.flushed < self.written {
+            self.writer.flush()?;
+            self.flushed = self.written;
+        }
+        let slot = |id: &u32| self.bricks[*id as usize].slot.expect("the brick's values were put in");
+        let mut bytes = Vec::new();
+        for run in ids.chunk_by(|a, b| slot(a) + 1 == slot(b)) {
+            bytes.resize(run.len() * SCRATCH_BRICK_BYTES, 0);
+            // Reader and writer share one file position.
+            self.reader.seek(SeekFrom::Start(u64::from(slot(&run[0])) * SCRATCH_BRICK_BYTES as u64))?;
+            self.reader.read_exact(&mut bytes)?;
+            out.extend(bytes.chunks_exact(SCRATCH_BRICK_BYTES).zip(run).map(|(values, &id)| {
+                let Known { active, keeps_mask, .. } = self.bricks[id as usize];
+                Brick { values: bytemuck::pod_read_unaligned(values), active, keeps_mask }
+            }));
+        }
+        self.reader.seek(SeekFrom::End(0)).map(drop)
     }
 }
-
 /// Keeps one copy of each run of values, in one growing array, and gives back where it lies.
 pub struct Interner<T> {
     by_hash: HashMap<u128, u32>,

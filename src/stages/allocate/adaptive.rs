@@ -4,17 +4,17 @@ use std::io;
 
 use super::search::GridSearch;
 use super::size::at_size;
-use super::trial::{ConstantAim, Trials};
 use super::{AllocateError, Allocation};
-use crate::settings::{FRAME_MARGIN_DB, Quality, RangeMode};
+use crate::settings::{FRAME_MARGIN_DB, Quality};
 use crate::stages::dedup::SequenceTree;
+use crate::stages::encodings::{Encodings, KeptCodec, Kind};
 
 /// One grid to be allocated.
 pub struct AdaptiveGrid<'a> {
     /// Its nodes and bricks.
     pub tree: &'a mut SequenceTree,
-    /// Level sets: voxels further from the surface than this must not change sides.
-    pub sign_matters: Option<f64>,
+    /// What codecs make of its bricks.
+    pub encodings: Encodings,
     /// A voxel's smallest side.
     pub voxel_size: f64,
 }
@@ -26,30 +26,27 @@ pub struct Target {
     pub quality: Quality,
     /// The PSNR that no frame falls below; 6 dB below the whole's where none is given.
     pub min_frame_psnr: Option<f64>,
-    /// What texels are fractions of.
-    pub range: RangeMode,
     /// Bytes of tree and masks with a record for every brick.
     pub fixed_bytes: u64,
 }
+
+/// BC7 takes twenty times as long as all others together, and is tried when it is asked for.
+const AT_ONCE: [Kind; 3] = [Kind::Plain, Kind::Texels(KeptCodec::Bc4), Kind::Texels(KeptCodec::Unorm8)];
 
 /// Gives each brick of each grid its codec. `advance` hears of bricks that BC7 was tried on.
 ///
 /// # Errors
 /// [`AllocateError`].
 pub fn adaptive(
-    grids: &mut [AdaptiveGrid],
+    grids: Vec<AdaptiveGrid>,
     target: &Target,
     advance: &mut dyn FnMut(u64),
 ) -> Result<Vec<Allocation>, AllocateError> {
-    let aim = match target.quality {
-        Quality::MaxError(_) => ConstantAim::Max,
-        _ => ConstantAim::Squares,
-    };
     let mut searches = Vec::new();
-    for (i, grid) in grids.iter_mut().enumerate() {
-        let ranges = Allocation::ranges(grid.tree, target.range).ok_or(AllocateError::TooWide { grid: i })?;
-        let trials = Trials::new(grid.tree, ranges, aim, grid.sign_matters)?;
-        searches.push(GridSearch::new(grid, trials));
+    for mut grid in grids {
+        let all: Vec<u32> = (0..grid.tree.pool.len()).collect();
+        grid.encodings.make(grid.tree, &all, &AT_ONCE, |_| ())?;
+        searches.push(GridSearch::new(grid));
     }
     let picks = match target.quality {
         Quality::Psnr(db) => {

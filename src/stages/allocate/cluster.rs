@@ -9,27 +9,30 @@ use super::{AllocateError, Allocation, Coding, Shape, uniform};
 use crate::codec::{BrickRange, Codec, SequenceRange, Texels, decode, encode};
 use crate::settings::{Clustering, RangeMode};
 use crate::stages::dedup::{SequenceTree, carried};
+use crate::stages::encodings::Encodings;
 use crate::volume::{BRICK_VOXELS, BRICKS_IN_FLIGHT, Brick, Mask512, ValueRange};
 
 /// Gives every brick of `tree` one codec, and clusters those of little variance. The voxels of those are in memory
 /// together: 2 KB a brick.
 ///
 /// # Errors
-/// [`AllocateError`]; its grid is 0.
+/// [`AllocateError`].
 pub fn clustered(
     tree: &mut SequenceTree,
+    encodings: Encodings,
     codec: Codec,
     mode: RangeMode,
     clustering: &Clustering,
 ) -> Result<Allocation, AllocateError> {
-    let mut allocation = uniform(tree, codec, mode).ok_or(AllocateError::TooWide { grid: 0 })?;
+    let mut allocation = uniform(tree, encodings, codec);
     let sequence = allocation.sequence;
     let (mut ids, mut points) = (Vec::new(), Vec::new());
     let mut bricks = Vec::new();
     for first in (0..tree.pool.len()).step_by(BRICKS_IN_FLIGHT as usize) {
         bricks.clear();
-        tree.pool.read(first..(first + BRICKS_IN_FLIGHT).min(tree.pool.len()), &mut bricks)?;
-        for (id, brick) in (first..).zip(&bricks) {
+        let window: Vec<u32> = (first..(first + BRICKS_IN_FLIGHT).min(tree.pool.len())).collect();
+        tree.read(&window, &mut bricks)?;
+        for (id, brick) in window.into_iter().zip(&bricks) {
             if variance(brick) <= clustering.variance {
                 ids.push(id);
                 points.extend(brick.values.iter().map(|v| fraction(&sequence, *v)));
@@ -48,8 +51,7 @@ pub fn clustered(
 
     let centroids: Vec<Texels> =
         found.centroids.rows().into_iter().map(|row| texels(&sequence, mode, &row.to_vec())).collect();
-    let encoded = encode(codec, &sequence, &centroids)
-        .map_err(|source| AllocateError::OutOfRange { grid: 0, source })?;
+    let encoded = encode(codec, &sequence, &centroids)?;
     let size = codec.layout().brick_bytes();
     allocation.shapes = encoded
         .bytes
@@ -77,10 +79,11 @@ pub fn clustered(
         ids.chunks(BRICKS_IN_FLIGHT as usize).zip(found.members.chunks(BRICKS_IN_FLIGHT as usize))
     {
         bricks.clear();
-        tree.pool.read_each(ids, &mut bricks)?;
+        tree.read(ids, &mut bricks)?;
         for ((&id, &member), brick) in ids.iter().zip(members).zip(&bricks) {
             let id = id as usize;
-            allocation.norms[id] = brick.error_norm(&decoded[member as usize], &carried(brick, rules[id]));
+            allocation.norms[id] =
+                brick.error_norm(&decoded[member as usize], &carried(&brick.active, rules[id]));
             allocation.codings[id] = Coding::Shared(member);
             allocation.ranges[id] = ranges[member as usize];
         }

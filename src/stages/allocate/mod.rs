@@ -1,32 +1,28 @@
 //! Stage 5: how each brick is coded, and what its texels' 0 and 1 stand for.
 //!
-//! A uniform format gives every brick one codec. The adaptive one tries codecs on bricks (`trial`) and gives
-//! each the one that serves the whole best (`search`, `size`), as rate-distortion theory has it: the least
+//! A uniform format gives every brick one codec. The adaptive one gives each the one that serves the whole best (`search`, `size`), as rate-distortion theory has it: the least
 //! D + λR, with one λ for all (Shoham & Gersho 1988).
 
 mod adaptive;
 mod cluster;
 pub mod kmeans;
+mod rung;
 mod search;
 mod share;
 mod size;
-mod trial;
 
 use std::io;
 
 use half::f16;
 
 use super::dedup::SequenceTree;
+use super::encodings::Encodings;
 use crate::codec::{BrickRange, Codec, OutOfRange, SequenceRange};
-use crate::settings::RangeMode;
 
 pub use adaptive::{AdaptiveGrid, Target, adaptive};
 pub use cluster::clustered;
 
-pub use trial::KeptTexels;
-
 /// How one grid's bricks are coded.
-#[derive(Default)]
 pub struct Allocation {
     /// The range that brick ranges are fractions of.
     pub sequence: SequenceRange,
@@ -41,8 +37,8 @@ pub struct Allocation {
     pub norms: Vec<f64>,
     /// The squared error of each frame's empty bricks.
     pub empty_squares: Vec<f64>,
-    /// Texels that were made to be tried.
-    pub kept: Option<KeptTexels>,
+    /// What codecs make of them.
+    pub encodings: Encodings,
 }
 
 /// What gives a brick its values.
@@ -74,51 +70,16 @@ pub enum AllocateError {
     /// Reading bricks back failed.
     #[error(transparent)]
     Io(#[from] io::Error),
-    /// A grid's values span more than an `f32` can hold.
-    #[error("the values of grid {grid} span more than an f32 can hold")]
-    TooWide {
-        /// Which of the grids.
-        grid: usize,
-    },
-    /// A value does not fit the codec, in the grid at this place.
-    #[error("{source}")]
-    OutOfRange {
-        /// Which of the grids.
-        grid: usize,
-        /// The value.
-        source: OutOfRange,
-    },
-}
-
-impl AllocateError {
-    /// The same of another grid.
-    pub fn in_grid(self, grid: usize) -> Self {
-        match self {
-            Self::TooWide { .. } => Self::TooWide { grid },
-            Self::OutOfRange { source, .. } => Self::OutOfRange { grid, source },
-            other => other,
-        }
-    }
+    /// A value does not fit the codec.
+    #[error(transparent)]
+    OutOfRange(#[from] OutOfRange),
 }
 
 impl Allocation {
-    /// The ranges of a grid's bricks; nothing is allocated yet. `None` when the sequence's values span more than an
-    /// `f32` can hold.
-    fn ranges(tree: &SequenceTree, mode: RangeMode) -> Option<(SequenceRange, Vec<BrickRange>)> {
-        let sequence = match tree.value_range() {
-            Some(range) => SequenceRange::around(range.min, range.max)?,
-            None => SequenceRange::default(),
-        };
-        let ranges = match mode {
-            RangeMode::Sequence => vec![BrickRange::SEQUENCE; tree.brick_ranges.len()],
-            RangeMode::Brick => tree.brick_ranges.iter().map(|r| sequence.fit(r.min, r.max)).collect(),
-        };
-        Some((sequence, ranges))
-    }
-
-    fn new(sequence: SequenceRange, ranges: Vec<BrickRange>, coding: Coding) -> Self {
+    fn new(encodings: Encodings, coding: Coding) -> Self {
+        let (sequence, ranges) = (encodings.sequence, encodings.ranges.clone());
         let (codings, norms) = (vec![coding; ranges.len()], vec![0.0; ranges.len()]);
-        Self { sequence, codings, ranges, shapes: Vec::new(), norms, empty_squares: Vec::new(), kept: None }
+        Self { sequence, codings, ranges, shapes: Vec::new(), norms, empty_squares: Vec::new(), encodings }
     }
 
     /// The codec of a brick.
@@ -146,10 +107,9 @@ impl Allocation {
     }
 }
 
-/// Gives every brick of `tree` one codec. `None` when the sequence's values span more than an `f32` can hold.
-pub fn uniform(tree: &SequenceTree, codec: Codec, mode: RangeMode) -> Option<Allocation> {
-    let (sequence, ranges) = Allocation::ranges(tree, mode)?;
-    let mut allocation = Allocation::new(sequence, ranges, Coding::Own(codec));
+/// Gives every brick of `tree` one codec.
+pub fn uniform(tree: &SequenceTree, encodings: Encodings, codec: Codec) -> Allocation {
+    let mut allocation = Allocation::new(encodings, Coding::Own(codec));
     allocation.tighten(tree);
-    Some(allocation)
+    allocation
 }

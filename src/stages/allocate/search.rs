@@ -11,10 +11,11 @@ use std::io;
 use rayon::prelude::*;
 
 use super::adaptive::AdaptiveGrid;
+use super::rung::Rung;
 use super::share::{Loan, loans};
-use super::trial::{Cost, Rung, Trials};
 use super::{Allocation, Coding, Shape};
 use crate::stages::dedup::{Payload, SequenceTree};
+use crate::stages::encodings::{Cost, Encodings, KeptCodec, Kind};
 use crate::volume::ValueRange;
 
 /// A step is 1.1 % of λ, under 0.05 dB of PSNR.
@@ -33,6 +34,12 @@ fn lambda(step: u32) -> f64 {
     }
 }
 
+/// Steps of λ, a quarter of an octave, that are one when it comes to who lends: 0.4 dB.
+const LENDING_STEPS: u32 = STEPS_PER_OCTAVE / 4;
+
+/// Bricks that a λ this much larger, an octave, would have made coarser may be so where there is room for it.
+const SLACK_STEPS: u32 = STEPS_PER_OCTAVE;
+
 /// An L3 record is three words.
 pub(super) const RECORD_BITS: u32 = 96;
 
@@ -42,7 +49,7 @@ const ROUNDING: f64 = 1.0 - 1e-6;
 /// One grid and what is known of it.
 pub(super) struct GridSearch<'a> {
     pub(super) tree: &'a mut SequenceTree,
-    trials: Trials,
+    encodings: Encodings,
     pub(super) voxel_size: f64,
     /// How often each brick is used over all frames.
     uses: Vec<u32>,
@@ -60,8 +67,8 @@ pub(super) struct GridSearch<'a> {
 }
 
 impl<'a> GridSearch<'a> {
-    pub(super) fn new(grid: &'a mut AdaptiveGrid, trials: Trials) -> Self {
-        let tree: &mut SequenceTree = grid.tree;
+    pub(super) fn new(grid: AdaptiveGrid<'a>) -> Self {
+        let tree = grid.tree;
         let mut uses = vec![0; tree.brick_ranges.len()];
         for frame in &tree.frames {
             tree.frame_bricks(frame).for_each(|id| uses[id as usize] += 1);
@@ -82,7 +89,7 @@ impl<'a> GridSearch<'a> {
             voxel_size: grid.voxel_size,
             uses,
             records,
-            trials,
+            encodings: grid.encodings,
             tree,
         }
     }
@@ -100,7 +107,7 @@ impl<'a> GridSearch<'a> {
     fn cost(&self, brick: usize, rung: Rung) -> Cost {
         match rung {
             Rung::Borrowed => self.loans[brick].map_or(Cost::IMPOSSIBLE, |loan| loan.cost),
-            rung => self.trials.cost(brick, rung).unwrap_or(Cost::NONE),
+            rung => rung.cost(&self.encodings, brick as u32).unwrap_or(Cost::NONE),
         }
     }
 
@@ -159,10 +166,9 @@ impl<'a> GridSearch<'a> {
         picks: impl Iterator<Item = (u32, Rung)>,
         advance: &mut dyn FnMut(u64),
     ) -> io::Result<bool> {
-        let unknown =
-            picks.filter(|&(id, rung)| rung == Rung::Bc7 && self.trials.cost(id as usize, rung).is_none());
+        let unknown = picks.filter(|&(id, rung)| rung.cost(&self.encodings, id).is_none());
         let unknown: Vec<u32> = unknown.map(|(id, _)| id).collect();
-        self.trials.try_bc7(self.tree, &unknown, advance)?;
+        self.encodings.make(self.tree, &unknown, &[Kind::Texels(KeptCodec::Bc7)], advance)?;
         Ok(!unknown.is_empty())
     }
 
@@ -173,7 +179,7 @@ impl<'a> GridSearch<'a> {
         advance: &mut dyn FnMut(u64),
     ) -> io::Result<Vec<Rung>> {
         let (step, alone) = self.at_psnr_with_loans(psnr, floor, advance)?;
-        self.find_loans(&alone, step)?;
+        self.find_loans(&alone, step, advance)?;
         let (_, together) = self.at_psnr_with_loans(psnr, floor, advance)?;
         let bits =
             |picks: &[Rung]| (0..).zip(picks).map(|(brick, &rung)| self.bits(brick, rung)).sum::<f64>();
@@ -212,23 +218,51 @@ impl<'a> GridSearch<'a> {
             if self.squares(&picks) > allowed {
                 picks = fine;
             }
+            self.spend_slack(&mut picks, allowed, step);
             if !self.raise_frames(&picks, floor, step, advance)? {
                 return Ok((step, picks));
             }
         }
     }
 
-    /// Finds out which bricks had better borrow, were λ what it is at `step`. A brick lends or borrows, and one that
-    /// lends keeps the codec it has.
-    pub(super) fn find_loans(&mut self, picks: &[Rung], step: u32) -> io::Result<()> {
-        let whole = |id: &u32| self.trials.is_whole(*id as usize) && picks[*id as usize] != Rung::Empty;
-        let borrowers: Vec<u32> = (0..picks.len() as u32).filter(whole).collect();
-        let lends = |&id: &u32| {
-            let rung = picks[id as usize];
-            matches!(rung, Rung::Bc7 | Rung::Bc4 | Rung::Unorm8).then_some((id, rung))
-        };
-        let lenders: Vec<(u32, Rung)> = borrowers.iter().filter_map(lends).collect();
-        let offers = loans(&mut self.trials, self.tree, &borrowers, &lenders)?;
+    /// The last brick that was made finer may have been a large one: where what it left over suffices for others to be
+    /// coarser, they are, least loss for a bit first.
+    fn spend_slack(&self, picks: &mut [Rung], allowed: f64, step: u32) {
+        let coarser = self.picks(step.saturating_sub(SLACK_STEPS));
+        let (before, mut squares) = (picks.to_vec(), self.squares(picks));
+        for switch in switches(0, self, &coarser, &before).into_iter().rev() {
+            let (brick, uses) = (switch.brick, f64::from(self.uses[switch.brick]));
+            let more = self.active_squares(brick, coarser[brick]) - self.active_squares(brick, picks[brick]);
+            if squares + uses * more <= allowed {
+                squares += uses * more;
+                picks[brick] = coarser[brick];
+            }
+        }
+        if self.squares(picks) > allowed {
+            picks.copy_from_slice(&before);
+        }
+    }
+
+    /// Finds out which bricks had better borrow, were λ what it is at `step` and every brick coded as in `picks`. A brick
+    /// lends or borrows, and one that lends keeps the codec it has.
+    pub(super) fn find_loans(
+        &mut self,
+        picks: &[Rung],
+        step: u32,
+        advance: &mut dyn FnMut(u64),
+    ) -> io::Result<()> {
+        // Who is compared with whom does not change with every little more or less of λ: an edited frame leaves what
+        // was found for the frames far from it as it is.
+        let near = ((step + LENDING_STEPS / 2) / LENDING_STEPS * LENDING_STEPS).min(LAST_STEP);
+        let mut compared = self.picks(near);
+        while self.try_unknown((0..).zip(compared.iter().copied()), advance)? {
+            compared = self.picks(near);
+        }
+        let is_whole = |id: &u32| self.encodings.is_whole(*id) && compared[*id as usize] != Rung::Empty;
+        let borrowers: Vec<u32> = (0..picks.len() as u32).filter(is_whole).collect();
+        let lends = |&id: &u32| KeptCodec::of(compared[id as usize].codec()).map(|codec| (id, codec));
+        let lenders: Vec<(u32, KeptCodec)> = borrowers.iter().filter_map(lends).collect();
+        let offers = loans(&mut self.encodings, self.tree, &borrowers, &lenders)?;
         let gain = |id: u32, loan: &Loan| {
             let brick = id as usize;
             let lambda = lambda(step.max(self.least_step[brick]));
@@ -239,6 +273,7 @@ impl<'a> GridSearch<'a> {
             .iter()
             .zip(&offers)
             .flat_map(|(&id, offers)| offers.iter().map(move |loan| (id, *loan)))
+            .filter(|(_, loan)| picks[loan.lender as usize] == compared[loan.lender as usize])
             .map(|(id, loan)| (gain(id, &loan), id, loan))
             .filter(|(gain, ..)| *gain > 0.0)
             .collect();
@@ -354,13 +389,14 @@ impl<'a> GridSearch<'a> {
         self.loans.iter_mut().filter(|loan| loan.as_ref().is_some_and(ended)).for_each(|loan| *loan = None);
     }
 
-    pub(super) fn finish(mut self, picks: &[Rung]) -> io::Result<Allocation> {
-        let mut allocation = Allocation::new(self.trials.sequence, self.trials.ranges.clone(), Coding::Empty);
+    pub(super) fn finish(self, picks: &[Rung]) -> io::Result<Allocation> {
+        let costs: Vec<f64> = (0..).zip(picks).map(|(brick, &rung)| self.cost(brick, rung).norm).collect();
+        let mut allocation = Allocation::new(self.encodings, Coding::Empty);
         for (brick, &rung) in picks.iter().enumerate() {
-            allocation.norms[brick] = self.cost(brick, rung).norm;
+            allocation.norms[brick] = costs[brick];
             allocation.codings[brick] = match rung {
                 Rung::Empty => Coding::Empty,
-                Rung::Constant => Coding::Constant(self.trials.constants[brick]),
+                Rung::Constant => Coding::Constant(allocation.encodings.plain(brick as u32).value),
                 Rung::Borrowed => continue,
                 rung => Coding::Own(rung.codec()),
             };
@@ -371,7 +407,8 @@ impl<'a> GridSearch<'a> {
             let lender = loan.lender as usize;
             allocation.codings[brick] = match allocation.codings[lender] {
                 Coding::Own(codec) => {
-                    let (bytes, axis) = self.trials.texels_of(self.tree, loan.lender, codec)?;
+                    let kept = KeptCodec::of(codec).expect("raw texels are not lent");
+                    let (bytes, axis) = allocation.encodings.texels(&[loan.lender], kept)?.remove(0);
                     allocation.shapes.push(Shape { codec, bytes, axis });
                     allocation.codings[lender] = Coding::Shared(allocation.shapes.len() as u32 - 1);
                     allocation.codings[lender]
@@ -386,7 +423,6 @@ impl<'a> GridSearch<'a> {
         allocation.empty_squares =
             frames.map(|f| self.tree.frame_bricks(f).filter(|&id| is_empty(id)).map(square).sum()).collect();
         self.tree.prune(is_empty);
-        allocation.kept = Some(self.trials.kept);
         Ok(allocation)
     }
 }

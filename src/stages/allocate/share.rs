@@ -4,22 +4,30 @@
 //! shape another's texels have already can do without texels: gain-shape vector quantisation (Gersho & Gray 1992, 12.10)
 //! with the coded bricks themselves for a codebook, which costs no bit and needs no training (a learned one was tried too:
 //! docs/decisions/0008-borrowed-texels.md).
+//!
+//! The bricks of a batch are compared with those of the batches near it: in a sequence those are the frame before and the
+//! one after.
 
+use std::collections::BTreeMap;
 use std::io;
+use std::ops::Range;
 
 use half::f16;
 use ndarray::Array2;
 use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
 
-use super::trial::{Cost, KeptOrBrick, Rung, Trials};
+use crate::cache::{Key, Stage};
 use crate::codec::{BrickRange, SequenceRange, decode};
 use crate::stages::dedup::SequenceTree;
-use crate::volume::{BRICK_VOXELS, Brick, InactiveRule, Mask512};
+use crate::stages::encodings::{Batch, Cost, Encodings, KeptCodec};
+use crate::volume::{BRICK_VOXELS, Brick, Mask512};
 
-/// Borrowers that are compared at a time, and on both sides of them in the pool, which is in order of frames, the
-/// lenders that they are compared with: enough for the frame before and the one after, and linear in the sequence.
-const BORROWERS: usize = 2048;
-/// Rows of one product: 256 × 8,192 similarities are 8 MB.
+const STAGE: Stage = Stage { name: "share", version: 1 };
+
+/// Bricks to either side that a batch is compared with at least: in short frames those of a few.
+const LEAST_NEAR: usize = 256;
+/// Rows of one product: 256 × 6,144 similarities are 6 MB.
 const ROWS: usize = 256;
 /// Lenders that are compared voxel by voxel.
 const CLOSEST: usize = 3;
@@ -37,9 +45,16 @@ pub(super) struct Loan {
     pub cost: Cost,
 }
 
+/// A [`Loan`] by its lender's place among the lenders that were compared, and its range as a record has it.
+#[derive(Clone, Copy, Serialize, Deserialize)]
+struct Offer {
+    lender: u32,
+    range: u32,
+    cost: Cost,
+}
+
 /// A brick that could lend, with its texels as a GPU reads them, 0 to 1.
 struct Lender {
-    id: u32,
     texels: Box<[f32; BRICK_VOXELS]>,
     mean: f64,
     /// Sum of squared differences from the mean.
@@ -48,44 +63,142 @@ struct Lender {
     trust: f64,
 }
 
-/// For each of `borrowers`, ascending, the nearest of `lenders`, ascending, each with its rung: the closest first.
+/// For each of `borrowers`, ascending, the nearest of `lenders`, ascending, each with its codec: the closest first.
 pub(super) fn loans(
-    trials: &mut Trials,
+    encodings: &mut Encodings,
     tree: &mut SequenceTree,
     borrowers: &[u32],
-    lenders: &[(u32, Rung)],
+    lenders: &[(u32, KeptCodec)],
 ) -> io::Result<Vec<Vec<Loan>>> {
+    let batches = encodings.batches().len();
+    let lenders_of: Vec<&[(u32, KeptCodec)]> =
+        encodings.batches().iter().map(|batch| part(lenders, |lender| lender.0, &batch.ids)).collect();
+    let mut near = Near::default();
     let mut found = Vec::with_capacity(borrowers.len());
-    for window in borrowers.chunks(BORROWERS) {
-        let (first, last) = (window[0], window[window.len() - 1]);
-        let from = lenders.partition_point(|(id, _)| *id < first).saturating_sub(BORROWERS);
-        let to = (lenders.partition_point(|(id, _)| *id <= last) + BORROWERS).min(lenders.len());
-        let lenders = trials.lenders(tree, &lenders[from..to])?;
-        let mut bricks = Vec::with_capacity(window.len());
-        tree.pool.read_each(window, &mut bricks)?;
-        found.extend(nearest(trials, window, &bricks, &lenders));
+    for batch in 0..batches {
+        let around = around(encodings.batches(), batch);
+        let ids = part(borrowers, |id| *id, &encodings.batches()[batch].ids);
+        let compared: Vec<(u32, KeptCodec)> = lenders_of[around.clone()].concat();
+        let key = key(encodings, tree, batch, &around, ids, &compared);
+        let known = key.and_then(|key| encodings.cache()?.get::<Vec<Vec<Offer>>>(&key));
+        let is_sound = |offers: &Vec<Vec<Offer>>| {
+            let lenders = compared.len();
+            offers.len() == ids.len() && offers.iter().flatten().all(|o| (o.lender as usize) < lenders)
+        };
+        let offers = match known.filter(is_sound) {
+            Some(offers) => offers,
+            None => {
+                let mut bricks = Vec::with_capacity(ids.len());
+                tree.read(ids, &mut bricks)?;
+                near.move_to(encodings, &around, &lenders_of)?;
+                let lenders: Vec<&Lender> = near.batches.values().flatten().collect();
+                let compared: Vec<u32> = compared.iter().map(|(id, _)| *id).collect();
+                let offers = nearest(encodings, ids, &bricks, &compared, &lenders);
+                if let Some((cache, key)) = encodings.cache().zip(key) {
+                    cache.put(&key, &offers);
+                }
+                offers
+            }
+        };
+        let loan = |offer: Offer| Loan {
+            lender: compared[offer.lender as usize].0,
+            range: BrickRange::from_word(offer.range),
+            cost: offer.cost,
+        };
+        found.extend(offers.into_iter().map(|offers| offers.into_iter().map(loan).collect::<Vec<_>>()));
     }
     Ok(found)
 }
 
-impl Trials {
-    fn lenders(&mut self, tree: &mut SequenceTree, ids: &[(u32, Rung)]) -> io::Result<Vec<Lender>> {
-        let kept = ids
-            .iter()
-            .map(|&(id, rung)| self.kept_or_brick(tree, id, rung.codec()))
-            .collect::<io::Result<Vec<_>>>()?;
-        let (trials, tree) = (&*self, &*tree);
-        let lender = |(&(id, rung), kept): (&(u32, Rung), KeptOrBrick)| {
-            let (bytes, axis) = trials.encode_kept(tree, id, rung.codec(), kept);
-            let texels = decode(rung.codec(), &bytes, axis, &SequenceRange::default(), BrickRange::SEQUENCE);
-            let (mean, energy) = moments(&texels);
-            let extent = trials.ranges[id as usize].extent.to_f64() * f64::from(trials.sequence.span);
-            let norm = trials.cost(id as usize, rung).map_or(0.0, |cost| cost.norm);
-            let trust = (1.0 - (norm / extent).powi(2) / energy.max(f64::MIN_POSITIVE)).max(0.0).sqrt();
-            Lender { id, texels, mean, energy, trust }
-        };
-        Ok(ids.par_iter().zip(kept).map(lender).collect())
+/// The batches that a batch is compared with: itself, the one before, the one after, and more to either side until there
+/// are [`LEAST_NEAR`] bricks.
+fn around(batches: &[Batch], batch: usize) -> Range<usize> {
+    let reach = |side: &mut dyn Iterator<Item = &Batch>| {
+        let mut bricks = 0;
+        side.take_while(|batch| {
+            let wanted = bricks < LEAST_NEAR;
+            bricks += batch.ids.len();
+            wanted
+        })
+        .count()
+    };
+    let before = reach(&mut batches[..batch].iter().rev());
+    batch - before..batch + 1 + reach(&mut batches[batch + 1..].iter())
+}
+
+/// The items whose bricks are in a range; they are ascending by brick.
+fn part<'a, T>(items: &'a [T], id: impl Fn(&T) -> u32, ids: &Range<u32>) -> &'a [T] {
+    let at = |end: u32| items.partition_point(|item| id(item) < end);
+    &items[at(ids.start)..at(ids.end)]
+}
+
+/// What the offers to a batch's borrowers depend on; `None` where nothing is cached.
+fn key(
+    encodings: &Encodings,
+    tree: &SequenceTree,
+    batch: usize,
+    around: &Range<usize>,
+    borrowers: &[u32],
+    lenders: &[(u32, KeptCodec)],
+) -> Option<Key> {
+    let batches = &encodings.batches()[around.clone()];
+    // The active voxels of these are those of frames that no key here stands for.
+    let is_widened = |id: u32| tree.pool.is_widened(id);
+    if borrowers.iter().any(|&id| is_widened(id)) || lenders.iter().any(|l| is_widened(l.0)) {
+        return None;
     }
+    let keys: Option<Vec<[u8; 32]>> = batches.iter().map(|b| b.key.map(|key| *key.digest())).collect();
+    let place = |id: u32| tree.pool.home(id).brick;
+    let borrowers: Vec<u32> = borrowers.iter().map(|&id| place(id)).collect();
+    let lenders: Vec<(u32, KeptCodec)> = lenders.iter().map(|&(id, codec)| (place(id), codec)).collect();
+    let own = batch - around.start;
+    Some(Key::new(&STAGE, &(keys?, own, borrowers, lenders)))
+}
+
+/// The lenders of the batches that are being compared.
+#[derive(Default)]
+struct Near {
+    batches: BTreeMap<usize, Vec<Lender>>,
+}
+
+impl Near {
+    /// Decodes the lenders of the batches in `around` that were not there for the batch before, and forgets others.
+    fn move_to(
+        &mut self,
+        encodings: &mut Encodings,
+        around: &Range<usize>,
+        lenders: &[&[(u32, KeptCodec)]],
+    ) -> io::Result<()> {
+        self.batches.retain(|batch, _| around.contains(batch));
+        for batch in around.clone() {
+            if !self.batches.contains_key(&batch) {
+                self.batches.insert(batch, decoded(encodings, lenders[batch])?);
+            }
+        }
+        Ok(())
+    }
+}
+
+fn decoded(encodings: &mut Encodings, lenders: &[(u32, KeptCodec)]) -> io::Result<Vec<Lender>> {
+    let mut texels: Vec<Option<(Vec<u8>, u8)>> = vec![None; lenders.len()];
+    for codec in KeptCodec::ALL {
+        let places: Vec<usize> = (0..lenders.len()).filter(|&i| lenders[i].1 == codec).collect();
+        let ids: Vec<u32> = places.iter().map(|&i| lenders[i].0).collect();
+        for (place, kept) in places.into_iter().zip(encodings.texels(&ids, codec)?) {
+            texels[place] = Some(kept);
+        }
+    }
+    let encodings = &*encodings;
+    let lender = |(&(id, codec), kept): (&(u32, KeptCodec), Option<(Vec<u8>, u8)>)| {
+        let (bytes, axis) = kept.expect("every lender is of one of the codecs");
+        let texels = decode(codec.codec(), &bytes, axis, &SequenceRange::default(), BrickRange::SEQUENCE);
+        let (mean, energy) = moments(&texels);
+        let extent = encodings.ranges[id as usize].extent.to_f64() * f64::from(encodings.sequence.span);
+        let norm = encodings.cost(id, codec).map_or(0.0, |cost| cost.norm);
+        let trust = (1.0 - (norm / extent).powi(2) / energy.max(f64::MIN_POSITIVE)).max(0.0).sqrt();
+        Lender { texels, mean, energy, trust }
+    };
+    Ok(lenders.par_iter().zip(texels).map(lender).collect())
 }
 
 /// Mean, and sum of squared differences from it.
@@ -106,7 +219,14 @@ fn coarse(values: &[f32; BRICK_VOXELS], mean: f64, energy: f64, out: &mut [f32])
     out.iter_mut().for_each(|v| *v = ((f64::from(*v) - 8.0 * mean) * scale) as f32);
 }
 
-fn nearest(trials: &Trials, ids: &[u32], bricks: &[Brick], lenders: &[Lender]) -> Vec<Vec<Loan>> {
+/// For each brick the closest of the lenders, whose numbers in the pool are `lender_ids`.
+fn nearest(
+    encodings: &Encodings,
+    ids: &[u32],
+    bricks: &[Brick],
+    lender_ids: &[u32],
+    lenders: &[&Lender],
+) -> Vec<Vec<Offer>> {
     let mut codebook = Array2::<f32>::zeros((lenders.len(), COARSE));
     for (lender, mut row) in lenders.iter().zip(codebook.rows_mut()) {
         let row = row.as_slice_mut().expect("rows are contiguous");
@@ -128,48 +248,44 @@ fn nearest(trials: &Trials, ids: &[u32], bricks: &[Brick], lenders: &[Lender]) -
             each.map(|((&id, brick), similar)| {
                 let mut closest = [(0.0f32, usize::MAX); CLOSEST];
                 for (j, &similar) in similar.iter().enumerate() {
-                    if similar > closest[CLOSEST - 1].0 && lenders[j].id != id {
+                    if similar > closest[CLOSEST - 1].0 && lender_ids[j] != id {
                         let at = closest.partition_point(|(s, _)| *s >= similar);
                         closest[at..].rotate_right(1);
                         closest[at] = (similar, j);
                     }
                 }
-                let found = closest.iter().filter_map(|&(_, j)| lenders.get(j));
-                let mut loans: Vec<Loan> = found.filter_map(|lender| trials.borrow(brick, lender)).collect();
-                loans.sort_by(|a, b| a.cost.norm.total_cmp(&b.cost.norm));
-                loans
+                let offer = |&(_, j): &(f32, usize)| {
+                    let (range, cost) = borrow(encodings, brick, lenders.get(j)?)?;
+                    Some(Offer { lender: j as u32, range: range.to_word(), cost })
+                };
+                let mut offers: Vec<Offer> = closest.iter().filter_map(offer).collect();
+                offers.sort_by(|a, b| a.cost.norm.total_cmp(&b.cost.norm));
+                offers
             })
             .collect::<Vec<_>>()
         })
         .collect()
 }
 
-impl Trials {
-    /// The brick as a line through a lender's texels; `None` if it runs the other way.
-    fn borrow(&self, brick: &Brick, lender: &Lender) -> Option<Loan> {
-        let (mean, _) = moments(&brick.values);
-        let pairs = brick.values.iter().zip(lender.texels.iter());
-        let product: f64 =
-            pairs.clone().map(|(v, t)| (f64::from(*v) - mean) * (f64::from(*t) - lender.mean)).sum();
-        let (lo, span) = (f64::from(self.sequence.lo), f64::from(self.sequence.span));
-        let gain = product / lender.energy;
-        let min = ((mean - gain * lender.mean - lo) / span * 65535.0).round().clamp(0.0, 65535.0);
-        // The minimum is coarse and may have met an end of the range: the extent makes the best of it.
-        let rest = lo + span * min / 65535.0;
-        let texel_squares: f64 = lender.texels.iter().map(|t| f64::from(*t).powi(2)).sum();
-        let dot: f64 = pairs.map(|(v, t)| (f64::from(*v) - rest) * f64::from(*t)).sum();
-        let extent = f16::from_f64(dot / texel_squares / span);
-        if !(extent.is_finite() && extent > f16::ZERO) {
-            return None;
-        }
-        let range = BrickRange { min: min as u16, extent };
-        let decoded = std::array::from_fn(|i| self.sequence.decode(range, lender.texels[i]));
-        let cost = self.measure(brick, &Mask512::ALL, &decoded, None);
-        Some(Loan { lender: lender.id, range, cost })
+/// The brick as a line through a lender's texels; `None` if it runs the other way.
+fn borrow(encodings: &Encodings, brick: &Brick, lender: &Lender) -> Option<(BrickRange, Cost)> {
+    let sequence = &encodings.sequence;
+    let (mean, _) = moments(&brick.values);
+    let pairs = brick.values.iter().zip(lender.texels.iter());
+    let product: f64 =
+        pairs.clone().map(|(v, t)| (f64::from(*v) - mean) * (f64::from(*t) - lender.mean)).sum();
+    let (lo, span) = (f64::from(sequence.lo), f64::from(sequence.span));
+    let gain = product / lender.energy;
+    let min = ((mean - gain * lender.mean - lo) / span * 65535.0).round().clamp(0.0, 65535.0);
+    // The minimum is coarse and may have met an end of the range: the extent makes the best of it.
+    let rest = lo + span * min / 65535.0;
+    let texel_squares: f64 = lender.texels.iter().map(|t| f64::from(*t).powi(2)).sum();
+    let dot: f64 = pairs.map(|(v, t)| (f64::from(*v) - rest) * f64::from(*t)).sum();
+    let extent = f16::from_f64(dot / texel_squares / span);
+    if !(extent.is_finite() && extent > f16::ZERO) {
+        return None;
     }
-
-    /// Whether a brick's texels give all of its voxels, so that it may borrow and lend.
-    pub fn is_whole(&self, brick: usize) -> bool {
-        self.rules[brick] == InactiveRule::Texel
-    }
+    let range = BrickRange { min: min as u16, extent };
+    let decoded = std::array::from_fn(|i| sequence.decode(range, lender.texels[i]));
+    Some((range, encodings.measure(brick, &Mask512::ALL, &decoded)))
 }

@@ -3,8 +3,8 @@
 use std::io;
 
 use super::adaptive::Target;
+use super::rung::Rung;
 use super::search::{GridSearch, RECORD_BITS, Switch, first_step, switches};
-use super::trial::Rung;
 use crate::codec::Codec;
 use crate::pack::tree::NODE_WORDS;
 use crate::settings::FRAME_MARGIN_DB;
@@ -31,7 +31,7 @@ pub(super) fn at_size(
         searches.iter().zip(picks).map(of_grid).sum()
     };
     for (search, picks) in searches.iter_mut().zip(&alone) {
-        search.find_loans(picks, step)?;
+        search.find_loans(picks, step, advance)?;
     }
     let (_, together) = at_size_above(searches, limit, fixed, &floors, advance)?;
     if squares(searches, &together) < squares(searches, &alone) && bytes(searches, &together, fixed) <= limit

@@ -29,8 +29,14 @@ pub struct GridInput {
     pub frames: Vec<FrameInput>,
     /// Its nodes and bricks.
     pub tree: SequenceTree,
-    /// Its codecs and ranges.
-    pub allocation: Allocation,
+    /// Its codecs and ranges; `None` while they are being chosen.
+    pub allocation: Option<Allocation>,
+}
+
+impl GridInput {
+    fn allocation(&self) -> &Allocation {
+        self.allocation.as_ref().expect("grids are allocated before they are written")
+    }
 }
 
 /// What the frame table says of a frame beside what its tree says.
@@ -74,7 +80,7 @@ pub fn serialise(
     zstd_level: Option<i32>,
     mut progress: impl FnMut(u64),
 ) -> Result<FinishedPack, SerialiseError> {
-    let layout = relayout::place(&grids.iter().map(|g| &g.allocation).collect::<Vec<_>>());
+    let layout = relayout::place(&grids.iter().map(GridInput::allocation).collect::<Vec<_>>());
     if layout.atlases.iter().any(|a| a.atlas.bricks >= L3Record::MAX_SLOTS) {
         return Err(too_large(
             &grids[0].name,
@@ -84,17 +90,17 @@ pub fn serialise(
     let boxes = grids.iter().map(CellBox::around).collect::<Result<Vec<_>, _>>()?;
     let mut words = TreeWords::build(grids, &boxes, &layout);
 
-    let plain = if zstd_level.is_some() { encoding::ZSTD } else { encoding::RAW };
     let level = zstd_level.unwrap_or(0);
     let names: String = grids.iter().map(|g| g.name.as_str()).collect();
     let frame_count: usize = grids.iter().map(|g| g.frames.len()).sum();
-    let provenance = serde_json::to_vec_pretty(provenance).map_err(io::Error::from)?;
+    let provenance = provenance.to_json()?;
     let atlases: Vec<AtlasRecord> = layout.atlases.iter().map(|a| atlas_record(&a.atlas)).collect();
 
-    let spec = |kind, encoding, raw_bytes: usize| SectionSpec {
+    let encoding = |kind, codec| encoding::of(kind, codec, zstd_level.is_some());
+    let spec = |kind, raw_bytes: usize| SectionSpec {
         kind,
         codec: 0,
-        encoding,
+        encoding: encoding(kind, 0),
         chunk_bytes: CHUNK_BYTES,
         raw_bytes: raw_bytes as u64,
     };
@@ -106,29 +112,31 @@ pub fn serialise(
         .map(|PlannedAtlas { atlas, .. }| SectionSpec {
             kind: kind::TEXELS,
             codec: atlas.codec as u32,
-            encoding: texel_encoding(atlas.codec, zstd_level.is_some()),
+            encoding: encoding(kind::TEXELS, atlas.codec as u32),
             chunk_bytes: atlas.slab_bytes() as u32,
             raw_bytes: atlas.bytes(),
         })
         .collect();
     let (mut frames, lists) = frame_tables(grids, &frame_slabs(grids, &layout));
     specs.extend([
-        spec(kind::GRIDS, encoding::RAW, grids.len() * size_of::<GridRecord>()),
-        spec(kind::NAMES, encoding::RAW, names.len()),
-        spec(kind::ATLASES, encoding::RAW, size_of_val(&*atlases)),
-        spec(kind::FRAME_CHUNKS, plain, size_of_val(&*lists)),
-        spec(kind::PROVENANCE, plain, provenance.len()),
-        spec(kind::FRAMES, plain, frame_count * size_of::<FrameRecord>()),
-        spec(kind::TREE, plain, words.words.len() * 4),
+        spec(kind::GRIDS, grids.len() * size_of::<GridRecord>()),
+        spec(kind::NAMES, names.len()),
+        spec(kind::ATLASES, size_of_val(&*atlases)),
+        spec(kind::FRAME_CHUNKS, size_of_val(&*lists)),
+        spec(kind::PROVENANCE, provenance.len()),
+        spec(kind::FRAMES, frame_count * size_of::<FrameRecord>()),
+        spec(kind::TREE, words.words.len() * 4),
     ]);
 
     let mut writer = PackWriter::create(path, specs)?;
-    let mut outcomes: Vec<Outcome> = grids.iter().map(|g| Outcome::before(&g.allocation)).collect();
-    let mut sources: Vec<GridBricks> =
-        grids.iter_mut().map(|g| GridBricks { tree: &mut g.tree, allocation: &mut g.allocation }).collect();
+    let mut outcomes: Vec<Outcome> = grids.iter().map(|g| Outcome::before(g.allocation())).collect();
+    let mut sources: Vec<GridBricks> = grids
+        .iter_mut()
+        .filter_map(|g| Some(GridBricks { tree: &mut g.tree, allocation: g.allocation.as_mut()? }))
+        .collect();
     for planned in &layout.atlases {
         writer.begin()?;
-        let encoding = texel_encoding(planned.atlas.codec, zstd_level.is_some());
+        let encoding = encoding(kind::TEXELS, planned.atlas.codec as u32);
         quantise(
             planned,
             &mut sources,
@@ -167,17 +175,8 @@ pub fn tree_bytes(grids: &[GridInput]) -> Result<u64, SerialiseError> {
 /// # Errors
 /// [`SerialiseError::TooLarge`].
 pub fn gpu_bytes(grids: &[GridInput]) -> Result<u64, SerialiseError> {
-    let layout = relayout::place(&grids.iter().map(|g| &g.allocation).collect::<Vec<_>>());
+    let layout = relayout::place(&grids.iter().map(GridInput::allocation).collect::<Vec<_>>());
     Ok(tree_bytes(grids)? + layout.atlases.iter().map(|a| a.atlas.bytes()).sum::<u64>())
-}
-
-fn texel_encoding(codec: Codec, zstd: bool) -> u32 {
-    match codec {
-        _ if !zstd => encoding::RAW,
-        Codec::F16 => encoding::ZSTD_SHUFFLE_2,
-        Codec::F32 => encoding::ZSTD_SHUFFLE_4,
-        _ => encoding::ZSTD,
-    }
 }
 
 fn too_large(grid: &str, what: String) -> SerialiseError {
@@ -227,7 +226,7 @@ fn frame_slabs(grids: &[GridInput], layout: &Layout) -> Vec<Vec<Vec<u32>>> {
     }
     let of_grid = |(grid, slots): (&GridInput, &Vec<u32>)| {
         let chunk = |id: u32| {
-            let codec = grid.allocation.codec(id);
+            let codec = grid.allocation().codec(id);
             let tag = codec as usize;
             (codec != Codec::Constant).then(|| first_chunk[tag] + slots[id as usize] / slab_bricks[tag])
         };
@@ -242,10 +241,10 @@ fn codec_norms(grid: &GridInput, outcome: &Outcome) -> [f32; Codec::WITH_TEXELS.
     let mut squares = [0.0; Codec::WITH_TEXELS.len() + 1];
     for frame in &grid.tree.frames {
         for id in grid.tree.frame_bricks(frame) {
-            squares[grid.allocation.codec(id) as usize] += outcome.norms[id as usize].powi(2);
+            squares[grid.allocation().codec(id) as usize] += outcome.norms[id as usize].powi(2);
         }
     }
-    squares[Codec::Constant as usize] += grid.allocation.empty_squares.iter().sum::<f64>();
+    squares[Codec::Constant as usize] += grid.allocation().empty_squares.iter().sum::<f64>();
     squares.map(|s: f64| (s.sqrt() as f32).min(f32::MAX))
 }
 
@@ -253,7 +252,7 @@ fn codec_norms(grid: &GridInput, outcome: &Outcome) -> [f32; Codec::WITH_TEXELS.
 fn set_errors(frames: &mut [FrameRecord], grids: &[GridInput], outcomes: &[Outcome]) {
     let mut frames = frames.iter_mut();
     for (grid, outcome) in grids.iter().zip(outcomes) {
-        let mut empty = grid.allocation.empty_squares.iter();
+        let mut empty = grid.allocation().empty_squares.iter();
         for (tree, frame) in grid.tree.frames.iter().zip(&mut frames) {
             let square = |id: u32| outcome.norms[id as usize].powi(2);
             let squares: f64 = grid.tree.frame_bricks(tree).map(square).sum();

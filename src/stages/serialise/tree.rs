@@ -185,7 +185,7 @@ impl TreeWords {
         for (grid, outcome) in grids.iter().zip(outcomes) {
             for &record in grid.tree.runs.items() {
                 if let Payload::Brick(id) = grid.tree.records[record as usize].payload
-                    && grid.allocation.codec(id) != Codec::Constant
+                    && grid.allocation().codec(id) != Codec::Constant
                 {
                     self.words[at] |= u32::from(outcome.axes[id as usize]) << 3;
                 }
@@ -205,8 +205,9 @@ fn grid_header(grid: &GridInput, bounds: &CellBox, root_at: usize) -> [u32; GRID
     words[g::ORIGIN..g::ORIGIN + 3].copy_from_slice(&bounds.origin.0.map(|v| v as u32));
     words[g::CELLS..g::CELLS + 3].copy_from_slice(&bounds.cells);
     words[g::ROOTS..g::ROOTS + 3].copy_from_slice(&bounds.roots);
-    words[g::LO] = grid.allocation.sequence.lo.to_bits();
-    words[g::SPAN] = grid.allocation.sequence.span.to_bits();
+    let sequence = grid.allocation.as_ref().map(|a| a.sequence).unwrap_or_default();
+    words[g::LO] = sequence.lo.to_bits();
+    words[g::SPAN] = sequence.span.to_bits();
     words[g::BACKGROUND] = grid.tree.background.to_bits();
     words[g::ROOT_AT] = root_at as u32;
     words[g::FRAMES] = grid.frames.len() as u32;
@@ -257,12 +258,12 @@ fn l3_record(grid: &GridInput, record: u32, slots: &[u32], first_mask: u32) -> L
     let (codec, slot, word2) = match record.payload {
         Payload::Constant(value) => (Codec::Constant, 0, value.to_bits()),
         Payload::Brick(id) => {
-            let word2 = match grid.allocation.codings[id as usize] {
+            let word2 = match grid.allocation().codings[id as usize] {
                 Coding::Empty => grid.tree.background.to_bits(),
                 Coding::Constant(value) => value.to_bits(),
-                _ => grid.allocation.ranges[id as usize].to_word(),
+                _ => grid.allocation().ranges[id as usize].to_word(),
             };
-            (grid.allocation.codec(id), slots[id as usize], word2)
+            (grid.allocation().codec(id), slots[id as usize], word2)
         }
     };
     L3Record { codec, axis: 0, slot, mask: record.mask.map(|m| first_mask + m), rule: record.rule, word2 }

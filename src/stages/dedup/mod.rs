@@ -1,31 +1,23 @@
 //! Stage 4: share bricks, masks, runs of L3 records and L2 nodes across a whole sequence.
 //!
 //! Frames are added in order; what a later frame has in common with an earlier one is not stored
-//! again. Everything here is exact: two things are one only if their bits are.
+//! again. Everything here is exact: two things are one only if their bits are. None of it needs voxels: those of a
+//! frame that is known from its [`Outline`] are fetched when someone asks for them.
 
-use std::collections::HashMap;
+mod outline;
+
+use std::collections::{BTreeSet, HashMap};
 use std::io;
+use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::stages::flatten::Flattened;
 use crate::volume::{
-    Brick, BrickPool, CellContent, Child, Constant, Coord, FrameStats, InactiveRule, Interner, Mask512,
+    Brick, BrickPool, CellContent, Child, Constant, Coord, FrameStats, Home, InactiveRule, Interner, Mask512,
     ValueRange, bits,
 };
 
-/// Whether bricks keep their active masks.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum MaskPolicy {
-    /// Always.
-    Keep,
-    /// Not where every inactive voxel is background: the texels carry the background then, and a
-    /// voxel is active where its value is something else.
-    DropWhereBackground,
-    /// The same, but only where the background is 0, as it is for fog: another one is not a value that
-    /// texels give back exactly.
-    DropFog,
-}
+pub use outline::{BrickOutline, MaskPolicy, Outline, Values, carried};
 
 /// One grid of a sequence, with everything that repeats stored once.
 pub struct SequenceTree {
@@ -41,14 +33,20 @@ pub struct SequenceTree {
     pub records: Vec<Record>,
     /// The distinct masks. A mask of signs follows the mask it belongs to.
     pub masks: Interner<Mask512>,
-    /// The voxels of the distinct bricks.
+    /// The distinct bricks.
     pub pool: BrickPool,
     /// For each brick of the pool, the range of the values that its texels carry.
     pub brick_ranges: Vec<ValueRange>,
-    policy: MaskPolicy,
+    /// For each frame, the bricks of the pool that it had first.
+    pub own_bricks: Vec<Range<u32>>,
+    /// Gives the voxels of a frame that was added without.
+    fetch: Option<Box<Fetch>>,
     record_of_brick: Vec<u32>,
     record_of_constant: HashMap<(u32, Option<u32>, InactiveRule), u32>,
 }
+
+/// Reads the bricks of the frame at a place anew.
+pub type Fetch = dyn Fn(usize) -> io::Result<Vec<Brick>> + Send + Sync;
 
 /// One frame of a [`SequenceTree`].
 pub struct FrameTree {
@@ -132,58 +130,13 @@ pub enum DedupError {
     },
 }
 
-/// A brick with what can be found out about it without knowing the others.
-struct Prepared {
-    brick: Brick,
-    rule: InactiveRule,
-    minus: Mask512,
-    range: Option<ValueRange>,
-    hash: u128,
-}
-
-impl Prepared {
-    fn new(mut brick: Brick, background: f32, policy: MaskPolicy) -> Self {
-        let (rule, minus) = brick.inactive_rule(background);
-        let drop = match policy {
-            MaskPolicy::Keep => false,
-            MaskPolicy::DropWhereBackground => true,
-            MaskPolicy::DropFog => background == 0.0,
-        };
-        brick.keeps_mask = !(drop && rule == InactiveRule::Background);
-        let rule = if brick.keeps_mask { rule } else { InactiveRule::Texel };
-        let range = brick.range_over(&carried(&brick, rule)).map(|(min, max)| ValueRange { min, max });
-        let hash = BrickPool::hash(&brick);
-        Self { brick, rule, minus, range, hash }
-    }
-
-    /// The one value that all carried voxels have, if they do.
-    fn constant(&self, background: f32) -> Option<f32> {
-        let Some(range) = self.range else { return Some(background) };
-        if range.min != range.max {
-            return None;
-        }
-        // 0 and −0 compare equal but are not the same bits.
-        let carried = carried(&self.brick, self.rule);
-        let mut values = carried.ones().map(|i| self.brick.values[i]);
-        let first = values.next()?;
-        values.all(|v| v.to_bits() == first.to_bits()).then_some(first)
-    }
-}
-
-/// The voxels whose values texels have to give: all but those that a rule gives.
-pub fn carried(brick: &Brick, rule: InactiveRule) -> Mask512 {
-    match rule {
-        InactiveRule::Background | InactiveRule::MinusBackground | InactiveRule::Sign => brick.active,
-        InactiveRule::Texel => Mask512::ALL,
-    }
-}
-
 impl SequenceTree {
-    /// An empty sequence.
+    /// An empty sequence. `fetch` gives the voxels of frames that are added without; it is not needed where all have
+    /// theirs.
     ///
     /// # Errors
     /// When no scratch file can be made.
-    pub fn new(policy: MaskPolicy) -> io::Result<Self> {
+    pub fn new(fetch: Option<Box<Fetch>>) -> io::Result<Self> {
         Ok(Self {
             background: 0.0,
             frames: Vec::new(),
@@ -193,26 +146,23 @@ impl SequenceTree {
             masks: Interner::default(),
             pool: BrickPool::new()?,
             brick_ranges: Vec::new(),
-            policy,
+            own_bricks: Vec::new(),
+            fetch,
             record_of_brick: Vec::new(),
             record_of_constant: HashMap::new(),
         })
     }
 
-    /// Adds the next frame.
+    /// Adds the next frame, and where they are at hand its voxels.
     ///
     /// # Errors
     /// [`DedupError`].
-    pub fn add(&mut self, flat: Flattened) -> Result<(), DedupError> {
-        self.check_background(&flat)?;
-        let frame = flat.frame;
-        let (background, policy) = (self.background, self.policy);
-        let bricks: Vec<Prepared> =
-            frame.bricks.into_par_iter().map(|b| Prepared::new(b, background, policy)).collect();
-
-        let mut cells = Vec::with_capacity(frame.cells.len());
+    pub fn add(&mut self, outline: Outline, voxels: Option<Vec<Brick>>) -> Result<(), DedupError> {
+        self.check_background(&outline)?;
+        let first = self.pool.len();
+        let mut cells = Vec::with_capacity(outline.cells.len());
         let mut run = Vec::new();
-        for cell in frame.cells {
+        for cell in outline.cells {
             let content = match cell.content {
                 CellContent::Constant(constant) => CellRef::Constant(constant),
                 CellContent::Node(children) => {
@@ -222,7 +172,7 @@ impl SequenceTree {
                         node.children[usize::from(place) >> 6] |= 1 << (place & 63);
                         run.push(match child {
                             Child::Constant(constant) => self.constant_region(constant),
-                            Child::Brick(brick) => self.brick(&bricks[brick as usize])?,
+                            Child::Brick(brick) => self.brick(brick, &outline.bricks[brick as usize]),
                         });
                     }
                     node.run = self.runs.intern(&run).into();
@@ -231,19 +181,50 @@ impl SequenceTree {
             };
             cells.push((cell.origin, content));
         }
-        self.frames.push(FrameTree { roots: frame.roots, cells, stats: frame.stats });
+        self.own_bricks.push(first..self.pool.len());
+        if let Some(voxels) = voxels {
+            self.put_voxels(self.frames.len(), &voxels)?;
+        }
+        self.frames.push(FrameTree { roots: outline.roots, cells, stats: outline.stats });
         Ok(())
     }
 
+    /// Puts the voxels of a frame's own bricks into the pool.
+    fn put_voxels(&mut self, frame: usize, voxels: &[Brick]) -> io::Result<()> {
+        for id in self.own_bricks[frame].clone() {
+            if !self.pool.is_there(id) {
+                self.pool.put(id, &voxels[self.pool.home(id).brick as usize].values)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Appends some bricks of the pool to `out`. Frames whose voxels are not there are read for it, whole.
+    ///
+    /// # Errors
+    /// When a frame or the scratch file cannot be read.
+    pub fn read(&mut self, ids: &[u32], out: &mut Vec<Brick>) -> io::Result<()> {
+        let absent = ids.iter().filter(|&&id| !self.pool.is_there(id)).map(|&id| self.pool.home(id).frame);
+        let absent: BTreeSet<u32> = absent.collect();
+        let absent: Vec<usize> = absent.into_iter().map(|frame| frame as usize).collect();
+        for frames in absent.chunks(rayon::current_num_threads()) {
+            let fetch =
+                self.fetch.as_ref().expect("frames without voxels are added with a way to fetch them");
+            let fetched: Vec<_> = frames.par_iter().map(|&frame| fetch(frame)).collect();
+            for (&frame, voxels) in frames.iter().zip(fetched) {
+                self.put_voxels(frame, &voxels?)?;
+            }
+        }
+        self.pool.read(ids, out)
+    }
+
     /// All frames have one background. A frame without any voxels takes on that of the others.
-    fn check_background(&mut self, flat: &Flattened) -> Result<(), DedupError> {
+    fn check_background(&mut self, outline: &Outline) -> Result<(), DedupError> {
         let empty = |f: &FrameTree| f.roots.is_empty() && f.cells.is_empty();
-        let (here, before) = (flat.background, self.background);
+        let (here, before) = (outline.background, self.background);
         if self.frames.iter().all(empty) {
             self.background = here;
-        } else if here.to_bits() != before.to_bits()
-            && !(flat.frame.roots.is_empty() && flat.frame.cells.is_empty())
-        {
+        } else if here.to_bits() != before.to_bits() && !outline.is_empty() {
             return Err(DedupError::Background { here, before });
         }
         Ok(())
@@ -267,30 +248,33 @@ impl SequenceTree {
         id
     }
 
-    fn brick(&mut self, prepared: &Prepared) -> io::Result<u32> {
-        let constant = prepared.constant(self.background);
-        let brick = match constant {
-            Some(_) => None,
-            None => Some(self.pool.insert(prepared.hash, &prepared.brick)?),
-        };
-        if let Some((id, false)) = brick {
-            return Ok(self.record_of_brick[id as usize]);
-        }
-        let mask = prepared.brick.keeps_mask.then(|| match prepared.rule {
-            InactiveRule::Sign => self.masks.intern(&[prepared.brick.active, prepared.minus]),
-            _ => self.masks.intern(&[prepared.brick.active]),
-        });
-        let rule = prepared.rule;
-        Ok(match (constant, brick) {
-            (Some(value), _) => self.constant_record(value, mask, rule),
-            (None, Some((id, _))) => {
-                let record = self.records.len() as u32;
-                self.records.push(Record { mask, rule, payload: Payload::Brick(id) });
-                self.record_of_brick.push(record);
-                self.brick_ranges.push(prepared.range.expect("a brick that is not constant carries values"));
-                record
+    /// The record of a brick of the frame that is being added.
+    fn brick(&mut self, place: u32, outline: &BrickOutline) -> u32 {
+        let &BrickOutline { ref active, keeps_mask, rule, values, .. } = outline;
+        let (range, digest) = match values {
+            Values::Constant(value) => {
+                let mask = self.mask(outline);
+                return self.constant_record(value, mask, rule);
             }
-            (None, None) => unreachable!("a brick that is not constant is in the pool"),
+            Values::Varied(range, digest) => (range, digest),
+        };
+        let home = Home { frame: self.frames.len() as u32, brick: place };
+        let (id, is_new) = self.pool.insert(&digest, active, keeps_mask, home);
+        if !is_new {
+            return self.record_of_brick[id as usize];
+        }
+        let mask = self.mask(outline);
+        let record = self.records.len() as u32;
+        self.records.push(Record { mask, rule, payload: Payload::Brick(id) });
+        self.record_of_brick.push(record);
+        self.brick_ranges.push(range);
+        record
+    }
+
+    fn mask(&mut self, outline: &BrickOutline) -> Option<u32> {
+        outline.keeps_mask.then(|| match outline.minus {
+            Some(minus) => self.masks.intern(&[outline.active, minus]),
+            None => self.masks.intern(&[outline.active]),
         })
     }
 

@@ -1,0 +1,193 @@
+//! Looks after a store: what is in it, what may go, whether it is sound.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime};
+
+use rayon::prelude::*;
+use serde::Serialize;
+
+use super::Cache;
+use super::store::{ASIDE, Entry, Map, STAMPS};
+
+/// Files that were being written this long ago were left by a process that was killed.
+const LEFT_BEHIND: Duration = Duration::from_secs(24 * 3600);
+
+/// What is in a store.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Stats {
+    /// Results by stage.
+    pub stages: BTreeMap<String, StageStats>,
+    /// Files of both maps.
+    pub entries: u64,
+    /// Their bytes.
+    pub bytes: u64,
+    /// Sources whose digests are remembered.
+    pub sources: u64,
+}
+
+/// The results of one stage.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct StageStats {
+    /// How many there are.
+    pub results: u64,
+    /// Their bytes; a result that stages share counts for each.
+    pub bytes: u64,
+}
+
+/// An entry that is not what it should be.
+#[derive(Clone, Debug, Serialize)]
+pub struct Damage {
+    /// The file.
+    pub path: PathBuf,
+    /// What is wrong with it.
+    pub why: String,
+}
+
+/// One file of the store.
+struct Found {
+    path: PathBuf,
+    bytes: u64,
+    used: SystemTime,
+}
+
+impl Cache {
+    /// Counts what is in the store.
+    ///
+    /// # Errors
+    /// When a folder of it cannot be listed.
+    pub fn stats(&self) -> io::Result<Stats> {
+        let mut stats = Stats { sources: self.files(STAMPS)?.len() as u64, ..Stats::default() };
+        for map in Map::ALL {
+            for found in self.files(map.folder())? {
+                stats.entries += 1;
+                stats.bytes += found.bytes;
+                if map == Map::Actions
+                    && let Ok(entry) = Entry::read(&found.path)
+                {
+                    let stage = stats.stages.entry(entry.stage()).or_default();
+                    stage.results += 1;
+                    stage.bytes += entry.blob.bytes;
+                }
+            }
+        }
+        Ok(stats)
+    }
+
+    /// Removes what was not used for `max_age`, then what was not used for longest until the rest takes at most
+    /// `max_bytes`. Gives the number of files removed and their bytes.
+    ///
+    /// # Errors
+    /// When a folder of the store cannot be listed.
+    pub fn collect(&self, max_bytes: Option<u64>, max_age: Option<Duration>) -> io::Result<(u64, u64)> {
+        let now = SystemTime::now();
+        let age = |found: &Found| now.duration_since(found.used).unwrap_or_default();
+        let mut files = Vec::new();
+        for map in Map::ALL {
+            files.extend(self.files(map.folder())?);
+        }
+        // Of what was used together, blobs go last: an action without its blob is of no use.
+        files.sort_by(|a, b| a.used.cmp(&b.used).then(a.bytes.cmp(&b.bytes)));
+        let mut left: u64 = files.iter().map(|f| f.bytes).sum();
+        let mut gone: Vec<Found> = Vec::new();
+        for found in files {
+            let is_old = max_age.is_some_and(|max| age(&found) > max);
+            if is_old || max_bytes.is_some_and(|max| left > max) {
+                left -= found.bytes;
+                gone.push(found);
+            }
+        }
+        gone.extend(self.files(ASIDE)?.into_iter().filter(|found| age(found) > LEFT_BEHIND));
+        gone.extend(self.files(STAMPS)?.into_iter().filter(|f| max_age.is_some_and(|max| age(f) > max)));
+        // Another process may have been quicker.
+        let removed = gone.iter().filter(|found| fs::remove_file(&found.path).is_ok());
+        Ok(removed.fold((0, 0), |(files, bytes), found| (files + 1, bytes + found.bytes)))
+    }
+
+    /// Reads every entry, and removes those that are damaged.
+    ///
+    /// # Errors
+    /// When a folder of the store cannot be listed.
+    pub fn verify(&self) -> io::Result<Vec<Damage>> {
+        let actions = self.files(Map::Actions.folder())?;
+        let blobs = self.files(Map::Blobs.folder())?;
+        let sound_action = |found: &Found| Entry::read(&found.path).map(drop);
+        let sound_blob = |found: &Found| match digest_in_name(&found.path) {
+            None => Err("its name is no digest".to_owned()),
+            Some(named) => {
+                let mut hasher = blake3::Hasher::new();
+                hasher.update_mmap(&found.path).map_err(|e| e.to_string())?;
+                if hasher.finalize() == named { Ok(()) } else { Err("its digest is not its name".to_owned()) }
+            }
+        };
+        let mut damaged: Vec<Damage> = Vec::new();
+        let damage = |found: &Found, sound: Result<(), String>| {
+            // What another process removed meanwhile is not damaged.
+            sound.err().filter(|_| found.path.exists()).map(|why| Damage { path: found.path.clone(), why })
+        };
+        damaged.par_extend(actions.par_iter().filter_map(|f| damage(f, sound_action(f))));
+        damaged.par_extend(blobs.par_iter().filter_map(|f| damage(f, sound_blob(f))));
+        for entry in &damaged {
+            let _ = fs::remove_file(&entry.path);
+        }
+        Ok(damaged)
+    }
+
+    /// Removes everything that the store made, and nothing else. Gives the number of files and their bytes.
+    ///
+    /// # Errors
+    /// When a folder of the store cannot be listed.
+    pub fn clear(&self) -> io::Result<(u64, u64)> {
+        let mut cleared = (0, 0);
+        for folder in [Map::Actions.folder(), Map::Blobs.folder(), STAMPS, ASIDE] {
+            for found in self.files(folder)? {
+                if fs::remove_file(&found.path).is_ok() {
+                    cleared = (cleared.0 + 1, cleared.1 + found.bytes);
+                }
+            }
+        }
+        Ok(cleared)
+    }
+
+    /// The files of one of the store's folders and of the folders in it.
+    fn files(&self, folder: &str) -> io::Result<Vec<Found>> {
+        let mut files = Vec::new();
+        let mut folders = vec![self.folder().join(folder)];
+        while let Some(folder) = folders.pop() {
+            let entries = match fs::read_dir(&folder) {
+                Ok(entries) => entries,
+                Err(e) if e.kind() == io::ErrorKind::NotFound => continue,
+                Err(e) => return Err(e),
+            };
+            for entry in entries {
+                let entry = entry?;
+                // What goes away while it is looked at is not there. Links are not followed.
+                let Ok(metadata) = entry.metadata() else { continue };
+                if metadata.is_dir() {
+                    folders.push(entry.path());
+                } else {
+                    let used = metadata.modified().unwrap_or(SystemTime::UNIX_EPOCH);
+                    files.push(Found { path: entry.path(), bytes: metadata.len(), used });
+                }
+            }
+        }
+        files.sort_by(|a, b| a.path.cmp(&b.path));
+        Ok(files)
+    }
+}
+
+impl Entry {
+    fn read(path: &Path) -> Result<Self, String> {
+        let bytes = fs::read(path).map_err(|e| e.to_string())?;
+        Self::from_bytes(&bytes).map_err(str::to_owned)
+    }
+}
+
+/// The digest that a blob's file and folder are named by.
+fn digest_in_name(path: &Path) -> Option<blake3::Hash> {
+    let name = path.file_name()?.to_str()?;
+    let folder = path.parent()?.file_name()?.to_str()?;
+    blake3::Hash::from_hex(format!("{folder}{name}")).ok()
+}

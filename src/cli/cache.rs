@@ -1,0 +1,155 @@
+//! `volpack cache`, and what other commands say of it.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use clap::{Args, Subcommand};
+use serde_json::json;
+
+use super::style::{GOOD, TITLE, WARNING, bytes, count};
+use super::{Common, outln, print_json};
+use crate::cache::Cache;
+use crate::error::{Error, Result};
+use crate::settings::ByteSize;
+
+/// Where what builds make is kept.
+#[derive(Args, Clone)]
+pub struct CacheArgs {
+    /// Where what was made is kept for the next build [default: the platform's folder for caches]
+    #[arg(long = "cache", value_name = "DIR", env = "VOLPACK_CACHE", hide_env_values = true)]
+    folder: Option<PathBuf>,
+}
+
+/// The same for commands that can do without.
+#[derive(Args, Clone)]
+pub struct CacheChoice {
+    #[command(flatten)]
+    place: CacheArgs,
+    /// Make everything anew and keep nothing
+    #[arg(long)]
+    no_cache: bool,
+    /// Hash sources that seem unchanged (size, times, inode) all the same
+    #[arg(long)]
+    pub paranoid: bool,
+}
+
+impl CacheArgs {
+    fn folder(&self) -> Result<PathBuf> {
+        self.folder.clone().or_else(Cache::default_folder).ok_or_else(|| {
+            Error::Usage("this platform names no folder for caches: give one with --cache DIR".to_owned())
+        })
+    }
+}
+
+impl CacheChoice {
+    /// The cache; `None` where none is wanted, or none can be had: that is a warning, and a slower build.
+    pub fn open(&self) -> Option<Arc<Cache>> {
+        if self.no_cache {
+            return None;
+        }
+        let opened = self.place.folder().and_then(|f| Cache::open(&f).map_err(Error::io(f)));
+        match opened {
+            Ok(cache) => Some(Arc::new(cache)),
+            Err(error) => {
+                anstream::eprintln!("{WARNING}warning{WARNING:#}: going on without a cache: {error}");
+                None
+            }
+        }
+    }
+}
+
+#[derive(Args)]
+pub struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+    #[command(flatten)]
+    place: CacheArgs,
+    /// Print JSON
+    #[arg(long, global = true)]
+    json: bool,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Say what is in the cache
+    Stats,
+    /// Remove what was not used for longest
+    Gc {
+        /// Until the rest takes at most this much: 20GB, 512MiB
+        #[arg(long, value_name = "SIZE", required_unless_present = "max_age")]
+        max_size: Option<ByteSize>,
+        /// What was not used for this long: 30d, 12h
+        #[arg(long, value_name = "AGE", value_parser = age)]
+        max_age: Option<Duration>,
+    },
+    /// Read every entry, and remove those that are damaged
+    Verify,
+    /// Remove everything
+    Clear,
+}
+
+/// `90m`, `12h`, `30d`.
+fn age(text: &str) -> std::result::Result<Duration, String> {
+    let syntax = || "an age is a number of minutes, hours or days: 90m, 12h, 30d".to_owned();
+    let text = text.trim();
+    let unit = text.chars().next_back().ok_or_else(syntax)?;
+    let seconds: u64 = match unit {
+        'm' => 60,
+        'h' => 3600,
+        'd' => 24 * 3600,
+        _ => return Err(syntax()),
+    };
+    let number: u64 = text[..text.len() - 1].trim().parse().map_err(|_| syntax())?;
+    number.checked_mul(seconds).map(Duration::from_secs).ok_or_else(syntax)
+}
+
+pub fn run(args: &Arguments, common: Common) -> Result<()> {
+    let folder = args.place.folder()?;
+    let cache = Cache::open(&folder).map_err(Error::io(&folder))?;
+    let failed = || Error::io(&folder);
+    let say = |json: serde_json::Value, text: String| {
+        if args.json {
+            print_json(&json);
+        } else if !common.quiet {
+            outln!("{TITLE}{}{TITLE:#}: {text}", folder.display());
+        }
+    };
+    match &args.command {
+        Command::Stats => {
+            let stats = cache.stats().map_err(failed())?;
+            let mut text = format!("{} in {} files", bytes(stats.bytes), count(stats.entries));
+            for (stage, of) in &stats.stages {
+                text += &format!("\n  {stage:14} {:>10} results {:>12}", count(of.results), bytes(of.bytes));
+            }
+            text += &format!("\n  {:14} {:>10} files", "sources known", count(stats.sources));
+            say(json!({ "folder": folder, "stats": stats }), text);
+        }
+        Command::Gc { max_size, max_age } => {
+            let (files, size) = cache.collect(max_size.map(|s| s.0), *max_age).map_err(failed())?;
+            say(json!({ "files": files, "bytes": size }), removed(files, size));
+        }
+        Command::Clear => {
+            let (files, size) = cache.clear().map_err(failed())?;
+            say(json!({ "files": files, "bytes": size }), removed(files, size));
+        }
+        Command::Verify => {
+            let damaged = cache.verify().map_err(failed())?;
+            if !damaged.is_empty() {
+                if args.json {
+                    print_json(&json!({ "ok": false, "removed": damaged }));
+                }
+                let each = damaged.iter().map(|d| format!("\n  {}: {}", d.path.display(), d.why));
+                let message =
+                    format!("{} damaged entries were removed:{}", damaged.len(), each.collect::<String>());
+                return Err(Error::Input(format!("{}: {message}", folder.display())));
+            }
+            say(json!({ "ok": true }), format!("{GOOD}ok{GOOD:#}"));
+        }
+    }
+    Ok(())
+}
+
+fn removed(files: u64, size: u64) -> String {
+    format!("removed {} in {} files", bytes(size), count(files))
+}

@@ -1,0 +1,179 @@
+//! Stages 3 and 4 over a sequence: what is known of a frame is taken from the cache, the rest is read.
+
+use std::sync::Arc;
+
+use rayon::prelude::*;
+
+use super::Progress;
+use crate::cache::{Cache, Key, Stage};
+use crate::error::{Error, Result};
+use crate::settings::{Format, Masks, Settings};
+use crate::stages::dedup::{DedupError, Fetch, MaskPolicy, Outline, SequenceTree};
+use crate::stages::encodings::GridCache;
+use crate::stages::flatten::{Flattened, flatten};
+use crate::stages::metadata::{FrameSource, SequenceInfo};
+use crate::stages::select::{SelectedGrid, Selection, find};
+use crate::stages::serialise::{FrameInput, GridInput};
+use crate::vdb::{GridClass, VdbFile};
+use crate::volume::{Brick, FlatFrame};
+
+/// What frames pass through before anything is made of them.
+pub type Alter<'a> = &'a (dyn Fn(&mut FlatFrame) + Sync);
+
+const OUTLINE: Stage = Stage { name: "outline", version: 1 };
+
+/// One grid of one frame, with its voxels unless they were not needed so far.
+type Frame = (Outline, Option<Vec<Brick>>);
+
+/// Reads frames, as many at a time as there are threads, and adds them in order.
+pub(super) fn read(
+    sequence: &SequenceInfo,
+    selection: &Selection,
+    settings: &Settings,
+    cache: Option<&Arc<Cache>>,
+    alter: Option<Alter>,
+    progress: &mut dyn Progress,
+) -> Result<Vec<GridInput>> {
+    let scratch = |e| Error::io(std::env::temp_dir())(e);
+    let mut grids: Vec<GridInput> = Vec::new();
+    for grid in &selection.grids {
+        let fetch = cache.is_some().then(|| fetch(sequence, grid, settings));
+        let tree = SequenceTree::new(fetch).map_err(scratch)?;
+        grids.push(grid_input(sequence, grid, tree, settings));
+    }
+    for window in sequence.frames.chunks(rayon::current_num_threads()) {
+        let read = |frame: &FrameSource| read_frame(frame, selection, settings, cache.map(|c| &**c), alter);
+        let frames: Vec<_> = window.par_iter().map(read).collect();
+        for (source, frame) in window.iter().zip(frames) {
+            for (grid, frame) in grids.iter_mut().zip(frame?) {
+                let Some((outline, voxels)) = frame else { continue };
+                grid.tree.add(outline, voxels).map_err(|e| match e {
+                    DedupError::Scratch { source } => scratch(source),
+                    DedupError::Background { .. } => Error::Input(format!(
+                        "{}: grid {:?}: {e}: export the whole sequence with one background",
+                        source.path.display(),
+                        grid.name
+                    )),
+                })?;
+            }
+            progress.advance(1);
+        }
+    }
+    Ok(grids)
+}
+
+/// The selected grids of one file; `None` for those that it does not have.
+fn read_frame(
+    frame: &FrameSource,
+    selection: &Selection,
+    settings: &Settings,
+    cache: Option<&Cache>,
+    alter: Option<Alter>,
+) -> Result<Vec<Option<Frame>>> {
+    let mut file = None;
+    let one = |grid: &SelectedGrid| -> Result<Option<Frame>> {
+        let Some(key) = key(frame, grid, settings) else { return Ok(None) };
+        let known = cache.and_then(|cache| cache.get::<Outline>(&key)).filter(Outline::is_sound);
+        if let Some(outline) = known {
+            return Ok(Some((outline, None)));
+        }
+        let file = match &file {
+            Some(file) => file,
+            None => file.insert(VdbFile::open(&frame.path).map_err(Error::vdb(&frame.path))?),
+        };
+        let mut flat = flatten_grid(file, frame, grid, settings)?;
+        if let Some(alter) = alter {
+            alter(&mut flat.frame);
+        }
+        let (outline, voxels) = Outline::split(flat, mask_policy(settings, grid.class));
+        if let Some(cache) = cache {
+            frame.check_unchanged()?;
+            cache.put(&key, &outline);
+        }
+        Ok(Some((outline, Some(voxels))))
+    };
+    selection.grids.iter().map(one).collect()
+}
+
+fn flatten_grid(
+    file: &VdbFile,
+    frame: &FrameSource,
+    grid: &SelectedGrid,
+    settings: &Settings,
+) -> Result<Flattened> {
+    // What the file says now may not be what it said when the grid was selected.
+    let info = find(&file.grids, &grid.name);
+    let info = info.filter(|info| info.value_type.is_scalar()).ok_or_else(|| {
+        Error::Input(format!("{}: grid {:?} is gone: the file changed", frame.path.display(), grid.name))
+    })?;
+    flatten(file, &frame.path, info, settings.nonfinite)
+}
+
+/// Reads the voxels of a grid's frames once more, for those whose outline alone is known.
+fn fetch(sequence: &SequenceInfo, grid: &SelectedGrid, settings: &Settings) -> Box<Fetch> {
+    let frames: Vec<FrameSource> = grid.frames.iter().map(|&i| sequence.frames[i].clone()).collect();
+    let (grid, settings) = (grid.clone(), settings.clone());
+    Box::new(move |place| {
+        let frame = &frames[place];
+        let voxels = || {
+            let file = VdbFile::open(&frame.path).map_err(Error::vdb(&frame.path))?;
+            let flat = flatten_grid(&file, frame, &grid, &settings)?;
+            frame.check_unchanged()?;
+            Ok(flat.frame.bricks)
+        };
+        voxels().map_err(|e: Error| std::io::Error::other(e))
+    })
+}
+
+/// What the outline of one grid of one frame depends on; `None` if the frame lacks the grid.
+fn key(frame: &FrameSource, grid: &SelectedGrid, settings: &Settings) -> Option<Key> {
+    let info = find(&frame.grids, &grid.name)?;
+    let policy = mask_policy(settings, grid.class);
+    Some(Key::new(&OUTLINE, &(frame.digest.as_bytes(), &info.name, settings.nonfinite, policy)))
+}
+
+/// For each grid, where what is made of its frames is kept.
+pub(super) fn caches(
+    sequence: &SequenceInfo,
+    selection: &Selection,
+    settings: &Settings,
+    cache: Option<&Arc<Cache>>,
+) -> Vec<Option<GridCache>> {
+    let of_grid = |grid: &SelectedGrid| {
+        let keys = grid.frames.iter().filter_map(|&i| key(&sequence.frames[i], grid, settings));
+        cache.map(|cache| GridCache { cache: Arc::clone(cache), frames: keys.collect() })
+    };
+    selection.grids.iter().map(of_grid).collect()
+}
+
+fn mask_policy(settings: &Settings, class: GridClass) -> MaskPolicy {
+    match (settings.masks, settings.format, class) {
+        (Masks::Keep, ..) | (Masks::Auto, Format::F32, _) | (Masks::Auto, _, GridClass::LevelSet) => {
+            MaskPolicy::Keep
+        }
+        (Masks::Auto, ..) => MaskPolicy::DropFog,
+        (Masks::Drop, ..) => MaskPolicy::DropWhereBackground,
+    }
+}
+
+fn grid_input(
+    sequence: &SequenceInfo,
+    grid: &SelectedGrid,
+    tree: SequenceTree,
+    settings: &Settings,
+) -> GridInput {
+    let frames = grid.frames.iter().map(|&i| {
+        let frame = &sequence.frames[i];
+        let info = find(&frame.grids, &grid.name).expect("the grid was selected in this frame");
+        let transform = info.transform.matrix.expect("the grid was selected for its linear map");
+        FrameInput { number: frame.number, source: i as u32, transform }
+    });
+    GridInput {
+        name: grid.name.clone(),
+        class: grid.class,
+        fps: settings.fps.unwrap_or(0.0),
+        frames: frames.collect(),
+        tree,
+        allocation: None,
+    }
+}

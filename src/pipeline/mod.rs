@@ -1,0 +1,366 @@
+//! Strings the stages together.
+
+mod allocation;
+mod frames;
+mod reuse;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+
+use serde::Serialize;
+
+use crate::cache::{Cache, Uses};
+use crate::error::{Error, Result};
+use crate::pack::{FinishedPack, Pack, Provenance, Source};
+use crate::report::PackSummary;
+use crate::settings::{Format, NOT_WITH_ADAPTIVE, Settings};
+use crate::stages::metadata::{self, Digests, SequenceInfo};
+use crate::stages::quantise::QuantiseError;
+use crate::stages::select::{Selection, select};
+use crate::stages::serialise::{GridInput, SerialiseError, serialise};
+use crate::verify::{self, PictureSettings, Sources, VerifyReport};
+use frames::Alter;
+use reuse::{Reuse, Reused};
+
+/// How much a finished pack is checked.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Serialize, clap::ValueEnum)]
+pub enum VerifyLevel {
+    /// Not at all
+    None,
+    /// Digests, offsets, indices and counts
+    Structure,
+    /// Those, and every voxel against the source
+    Voxels,
+    /// Those, and pictures of pack and source
+    #[default]
+    All,
+}
+
+/// One pack to build.
+#[derive(Clone)]
+pub struct Job {
+    /// The source files.
+    pub frames: Vec<PathBuf>,
+    /// Where the pack goes.
+    pub output: PathBuf,
+    /// How it is made.
+    pub settings: Settings,
+    /// Whether warnings are errors.
+    pub strict: bool,
+    /// How much is checked afterwards.
+    pub verify: VerifyLevel,
+    /// How pictures are compared.
+    pub pictures: PictureSettings,
+    /// Where what stages made is kept.
+    pub cache: Option<Arc<Cache>>,
+    /// Whether sources that seem unchanged are hashed all the same.
+    pub paranoid: bool,
+}
+
+impl Job {
+    /// A build whose warnings are warnings, with the usual pictures, from the ground up.
+    pub fn new(frames: Vec<PathBuf>, output: PathBuf, settings: Settings, verify: VerifyLevel) -> Self {
+        let pictures = PictureSettings::default();
+        Self { frames, output, settings, strict: false, verify, pictures, cache: None, paranoid: false }
+    }
+}
+
+/// Hears how a build is getting on. Called from one thread at a time.
+pub trait Progress {
+    /// A stage begins, which has that many steps of that kind.
+    fn stage(&mut self, name: &'static str, steps: u64, unit: &'static str);
+    /// That many more steps of the stage are done.
+    fn advance(&mut self, steps: u64);
+    /// Something is odd but does not stop the build.
+    fn warn(&mut self, warning: &str);
+}
+
+/// Progress that nobody hears of.
+pub struct Silent;
+
+impl Progress for Silent {
+    fn stage(&mut self, _: &'static str, _: u64, _: &'static str) {}
+    fn advance(&mut self, _: u64) {}
+    fn warn(&mut self, _: &str) {}
+}
+
+/// What a build did.
+pub struct Outcome {
+    /// What was odd.
+    pub warnings: Vec<String>,
+    /// Seconds by stage, in order.
+    pub seconds: Vec<(&'static str, f64)>,
+    /// What is in the pack.
+    pub summary: PackSummary,
+    /// What verification found, if voxels were compared.
+    pub verification: Option<VerifyReport>,
+    /// How much of the pack was made before.
+    pub made: Made,
+    /// Whether the verification was made before.
+    pub was_verified: bool,
+    /// How often each stage's results were found in the cache, and how often not.
+    pub cache: BTreeMap<&'static str, Uses>,
+}
+
+/// How a pack came to be.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Made {
+    /// By the stages, each with what the cache had for it.
+    Built,
+    /// From a pack that differs in nothing but zstd's level.
+    Repacked,
+    /// It was in the cache.
+    Copied,
+    /// It was there already.
+    Unchanged,
+}
+
+/// Builds one pack, and verifies it as the job asks.
+///
+/// # Errors
+/// The first thing that is wrong, with its file and grid. A report that is not ok is no error. In both
+/// cases the output is what it was before.
+pub fn build(job: &Job, progress: &mut dyn Progress) -> Result<Outcome> {
+    build_with(job, None, progress)
+}
+
+/// The same from frames that pass through `alter` first, for measurements on input that is in no file. What is
+/// altered cannot be verified against its files, and is not cached.
+///
+/// # Errors
+/// As [`build`].
+pub fn build_altered(job: &Job, alter: Alter, progress: &mut dyn Progress) -> Result<Outcome> {
+    build_with(job, Some(alter), progress)
+}
+
+fn build_with(job: &Job, alter: Option<Alter>, progress: &mut dyn Progress) -> Result<Outcome> {
+    let cache = job.cache.as_ref().filter(|_| alter.is_none());
+    let outcome = build_cached(job, cache, alter, progress);
+    // Also after an error: what was done until then is there for the next build.
+    let warnings = cache.map(|cache| cache.flush()).unwrap_or_default();
+    warnings.iter().for_each(|warning| progress.warn(warning));
+    outcome
+}
+
+fn build_cached(
+    job: &Job,
+    cache: Option<&Arc<Cache>>,
+    alter: Option<Alter>,
+    progress: &mut dyn Progress,
+) -> Result<Outcome> {
+    let mut clock = Clock::new();
+    let (plan, warnings) = plan(job, progress)?;
+    for warning in &warnings {
+        if job.strict {
+            return Err(Error::Input(format!("{warning} (an error because of --strict)")));
+        }
+        progress.warn(warning);
+    }
+    clock.lap("metadata");
+
+    let reuse = cache.map(|cache| Reuse::new(cache, &plan.provenance));
+    let reused = match &reuse {
+        Some(reuse) => reuse.find(job, &plan.provenance)?,
+        None => Reused::Nothing,
+    };
+    let (made, finished) = match reused {
+        Reused::Unchanged => (Made::Unchanged, None),
+        Reused::Pack(made, pack) => (made, Some(pack)),
+        Reused::Nothing => (Made::Built, Some(run_stages(job, cache, alter, &plan, &mut clock, progress)?)),
+    };
+    let path = finished.as_ref().map_or(&*job.output, FinishedPack::path);
+    if let (Some(reuse), Made::Built | Made::Repacked) = (&reuse, made) {
+        reuse.keep(path)?;
+    }
+    clock.lap(if made == Made::Built { "encode and serialise" } else { "reuse" });
+
+    let (pack, verification, was_verified) = match reuse.as_ref().and_then(|reuse| reuse.verification(job)) {
+        Some(report) => (Pack::open(path).map_err(Error::pack(path))?, report, true),
+        None => {
+            let (pack, report) = verified(job, path, progress)?;
+            if let Some(reuse) = &reuse {
+                reuse.keep_verification(job, report.as_ref());
+            }
+            (pack, report, false)
+        }
+    };
+    clock.lap("verify");
+    let summary = PackSummary::new(&pack);
+    // A mapped file cannot be renamed everywhere.
+    drop(pack);
+    if verification.as_ref().is_none_or(|report| report.ok) {
+        finished.map_or(Ok(()), FinishedPack::persist).map_err(Error::io(&job.output))?;
+    }
+    let uses = cache.map(|cache| cache.take_uses()).unwrap_or_default();
+    let seconds = clock.laps;
+    Ok(Outcome { warnings, seconds, summary, verification, made, was_verified, cache: uses })
+}
+
+/// What a job comes to, as far as it can be told without a voxel.
+pub(crate) struct Plan {
+    sequence: SequenceInfo,
+    selection: Selection,
+    provenance: Provenance,
+}
+
+/// Stages 1 and 2, and what they found odd.
+fn plan(job: &Job, progress: &mut dyn Progress) -> Result<(Plan, Vec<String>)> {
+    check_output(job)?;
+    if job.settings.format == Format::Adaptive && job.settings.clustering.is_some() {
+        return Err(Error::Usage(NOT_WITH_ADAPTIVE.to_owned()));
+    }
+    progress.stage("metadata", job.frames.len() as u64, "files");
+    let digests = Digests { cache: job.cache.as_deref(), paranoid: job.paranoid };
+    let sequence = metadata::read(&job.frames, digests)?;
+    let selection = select(&sequence, &job.settings.grids)?;
+    let warnings = [&sequence.warnings[..], &selection.warnings].concat();
+    let provenance = provenance(&sequence, &job.settings);
+    Ok((Plan { sequence, selection, provenance }, warnings))
+}
+
+/// Stages 3 to 8.
+fn run_stages(
+    job: &Job,
+    cache: Option<&Arc<Cache>>,
+    alter: Option<Alter>,
+    plan: &Plan,
+    clock: &mut Clock,
+    progress: &mut dyn Progress,
+) -> Result<FinishedPack> {
+    progress.stage("flatten", plan.sequence.frames.len() as u64, "frames");
+    let mut grids = frames::read(&plan.sequence, &plan.selection, &job.settings, cache, alter, progress)?;
+    clock.lap("flatten and dedup");
+    let caches = frames::caches(&plan.sequence, &plan.selection, &job.settings, cache);
+    allocation::allocate(&mut grids, &job.settings, caches, progress)?;
+    clock.lap("allocate");
+    let bricks: u64 = grids.iter().map(|g| u64::from(g.tree.pool.len())).sum();
+    progress.stage("encode", bricks, "bricks");
+    let level = (job.settings.zstd != 0).then_some(job.settings.zstd);
+    let finished =
+        serialise(&job.output, &mut grids, &plan.provenance, level, |bricks| progress.advance(bricks))
+            .map_err(|e| serialise_error(e, &grids, &job.output))?;
+    for grid in &mut grids {
+        if let Some(allocation) = &mut grid.allocation {
+            allocation.encodings.save(&grid.tree).map_err(Error::io(std::env::temp_dir()))?;
+        }
+    }
+    Ok(finished)
+}
+
+/// Opens a pack and checks as much of it as the job asks.
+fn verified(job: &Job, path: &Path, progress: &mut dyn Progress) -> Result<(Pack, Option<VerifyReport>)> {
+    let pack = match job.verify {
+        VerifyLevel::None => Pack::open(path).map_err(Error::pack(path))?,
+        _ => check_structure(path)?,
+    };
+    if job.verify < VerifyLevel::Voxels {
+        return Ok((pack, None));
+    }
+    let pictures = (job.verify == VerifyLevel::All).then_some(&job.pictures);
+    let report = verify_against(&pack, &job.frames, pictures, progress)?;
+    Ok((pack, Some(report)))
+}
+
+/// A slip in the arguments must not cost anyone a source file.
+fn check_output(job: &Job) -> Result<()> {
+    let Ok(output) = job.output.canonicalize() else { return Ok(()) };
+    if job.frames.iter().any(|f| f.canonicalize().is_ok_and(|f| f == output)) {
+        return Err(Error::Usage(format!(
+            "{} is a source of the pack and its output too",
+            job.output.display()
+        )));
+    }
+    let mut magic = [0; 8];
+    let is_pack =
+        std::fs::File::open(&output).and_then(|mut f| std::io::Read::read_exact(&mut f, &mut magic)).is_ok()
+            && magic == crate::pack::layout::MAGIC;
+    if !is_pack {
+        return Err(Error::Usage(format!(
+            "{} exists and is not a pack: delete it, or choose another output",
+            job.output.display()
+        )));
+    }
+    Ok(())
+}
+
+/// Compares a pack's voxels, and pictures where settings for them are given, with its sources.
+///
+/// # Errors
+/// When a source is missing, changed or unreadable, or the pack is damaged. Differences are no error:
+/// they are in the report.
+pub fn verify_against(
+    pack: &Pack,
+    files: &[PathBuf],
+    pictures: Option<&PictureSettings>,
+    progress: &mut dyn Progress,
+) -> Result<VerifyReport> {
+    progress.stage("verify", files.len() as u64, "frames");
+    let sources = Sources::find(pack, files)?;
+    let mut report = verify::voxels(pack, &sources, |frames| progress.advance(frames))?;
+    if let Some(settings) = pictures {
+        report.add_pictures(verify::pictures(pack, &sources, settings)?);
+    }
+    Ok(report)
+}
+
+/// Opens a pack and checks every byte of it that can be checked without its source.
+///
+/// # Errors
+/// [`Error::Pack`].
+pub fn check_structure(path: &Path) -> Result<Pack> {
+    let pack = Pack::open(path).map_err(Error::pack(path))?;
+    pack.check_chunks().map_err(Error::pack(path))?;
+    Ok(pack)
+}
+
+struct Clock {
+    last: Instant,
+    laps: Vec<(&'static str, f64)>,
+}
+
+impl Clock {
+    fn new() -> Self {
+        Self { last: Instant::now(), laps: Vec::new() }
+    }
+
+    fn lap(&mut self, name: &'static str) {
+        let now = Instant::now();
+        self.laps.push((name, (now - self.last).as_secs_f64()));
+        self.last = now;
+    }
+}
+
+fn provenance(sequence: &SequenceInfo, settings: &Settings) -> Provenance {
+    let uses_block_encoder = matches!(settings.format, Format::Bc4 | Format::Bc7 | Format::Adaptive);
+    Provenance {
+        tool: env!("CARGO_PKG_NAME").to_owned(),
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        encoder_isa: uses_block_encoder.then(|| crate::codec::encoder_isa().to_owned()),
+        settings: settings.clone(),
+        sources: sequence
+            .frames
+            .iter()
+            .map(|f| Source {
+                file: f.file_name(),
+                frame: f.number,
+                bytes: f.stamp.bytes(),
+                blake3: f.digest.to_hex().to_string(),
+            })
+            .collect(),
+    }
+}
+
+fn serialise_error(error: SerialiseError, grids: &[GridInput], output: &Path) -> Error {
+    match error {
+        SerialiseError::Io(source) | SerialiseError::Quantise(QuantiseError::Io(source)) => {
+            Error::io(output)(source)
+        }
+        SerialiseError::Quantise(QuantiseError::OutOfRange { grid, source }) => {
+            Error::OutOfRange { grid: grids[grid].name.clone(), source }
+        }
+        SerialiseError::TooLarge { .. } => Error::Unsupported(error.to_string()),
+    }
+}

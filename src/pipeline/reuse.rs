@@ -1,0 +1,118 @@
+//! Whole packs and reports that were made before.
+
+use std::path::Path;
+
+use super::{Job, Made, VerifyLevel};
+use crate::cache::{Blob, Cache, Key, Stage, Stamp};
+use crate::error::{Error, Result};
+use crate::pack::{FinishedPack, Pack, Provenance, repack};
+use crate::stages::metadata::digest;
+use crate::verify::VerifyReport;
+
+const PACK: Stage = Stage { name: "pack", version: 1 };
+/// A pack whose level of zstd is not what was asked for, but all else is.
+const ANY_LEVEL: Stage = Stage { name: "pack-any-zstd", version: 1 };
+const VERIFY: Stage = Stage { name: "verify", version: 1 };
+
+/// What the cache may have for a job.
+pub(super) struct Reuse<'a> {
+    cache: &'a Cache,
+    exact: Key,
+    any_level: Key,
+}
+
+/// What it had.
+pub(super) enum Reused {
+    Nothing,
+    /// The output is the pack already.
+    Unchanged,
+    /// The pack, beside its place.
+    Pack(Made, FinishedPack),
+}
+
+impl<'a> Reuse<'a> {
+    /// A pack's bytes depend on its provenance, and on nothing that is not in it.
+    pub fn new(cache: &'a Cache, provenance: &Provenance) -> Self {
+        let mut any = provenance.clone();
+        any.settings.zstd = 0;
+        let key = |stage, provenance: &Provenance| Key::new(stage, &provenance.to_json().unwrap_or_default());
+        Self { cache, exact: key(&PACK, provenance), any_level: key(&ANY_LEVEL, &any) }
+    }
+
+    /// The pack, if it is there already, in the cache, or there at another level of zstd.
+    pub fn find(&self, job: &Job, provenance: &Provenance) -> Result<Reused> {
+        let exact = self.cache.blob(&self.exact);
+        let found = match exact {
+            Some(blob) if self.is_at(&job.output, &blob, job.paranoid) => Reused::Unchanged,
+            Some(blob) => self.copy(job, &blob)?.map_or(Reused::Nothing, |p| Reused::Pack(Made::Copied, p)),
+            None => Reused::Nothing,
+        };
+        let found = match found {
+            Reused::Nothing => self.repack(job, provenance)?,
+            found => found,
+        };
+        self.cache.count_file(&self.exact, !matches!(found, Reused::Nothing));
+        Ok(found)
+    }
+
+    /// Whether a file has a blob's bytes.
+    fn is_at(&self, path: &Path, blob: &Blob, paranoid: bool) -> bool {
+        let Ok(stamp) = Stamp::of(path) else { return false };
+        if stamp.bytes() != blob.bytes {
+            return false;
+        }
+        let known = self.cache.remembered(path, &stamp).filter(|_| !paranoid);
+        let digest = known.or_else(|| {
+            let (digest, _) = digest(path).ok()?;
+            self.cache.remember(path, &stamp, &digest);
+            Some(digest)
+        });
+        digest.is_some_and(|digest| digest == blob.digest)
+    }
+
+    fn copy(&self, job: &Job, blob: &Blob) -> Result<Option<FinishedPack>> {
+        FinishedPack::filled(&job.output, |file| self.cache.get_file(blob, file))
+            .map_err(Error::io(&job.output))
+    }
+
+    fn repack(&self, job: &Job, provenance: &Provenance) -> Result<Reused> {
+        let Some(blob) = self.cache.blob(&self.any_level) else { return Ok(Reused::Nothing) };
+        let Some(copy) = self.copy(job, &blob)? else { return Ok(Reused::Nothing) };
+        let level = (job.settings.zstd != 0).then_some(job.settings.zstd);
+        // The blob's digest was right, so it is a pack, or the entry is another program's and no use.
+        let Ok(pack) = Pack::open(copy.path()) else { return Ok(Reused::Nothing) };
+        let pack = repack(&pack, &job.output, provenance, level).map_err(Error::pack(&job.output))?;
+        Ok(Reused::Pack(Made::Repacked, pack))
+    }
+
+    /// Keeps a pack that was made.
+    pub fn keep(&self, path: &Path) -> Result<()> {
+        let (digest, bytes) = digest(path)?;
+        let blob = Blob { digest: digest.into(), bytes };
+        self.cache.put_file(&self.exact, path, blob);
+        self.cache.put_file(&self.any_level, path, blob);
+        Ok(())
+    }
+
+    /// What verification as the job asks for it found in the same pack.
+    pub fn verification(&self, job: &Job) -> Option<Option<VerifyReport>> {
+        self.cache.get(&self.verify_key(job)?)
+    }
+
+    /// Keeps what verification found. Failures are found again.
+    pub fn keep_verification(&self, job: &Job, report: Option<&VerifyReport>) {
+        if let Some(key) = self.verify_key(job).filter(|_| report.is_none_or(|report| report.ok)) {
+            self.cache.put(&key, &report);
+        }
+    }
+
+    /// A pack names its sources by their digests, so its own stands for them too. `None` where files are to be written,
+    /// or nothing to be found.
+    fn verify_key(&self, job: &Job) -> Option<Key> {
+        if job.verify == VerifyLevel::None || job.pictures.images.is_some() {
+            return None;
+        }
+        let pack = self.cache.blob(&self.exact)?;
+        Some(Key::new(&VERIFY, &(pack.digest, job.verify, job.pictures.max_flip, job.pictures.device)))
+    }
+}

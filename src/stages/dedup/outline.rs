@@ -1,0 +1,137 @@
+//! What a flattened frame is without its voxels: all that sharing needs, in a seventh of the source's bytes.
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::stages::flatten::Flattened;
+use crate::volume::{
+    Brick, BrickPool, CELL_DIM, Cell, CellContent, Child, Constant, Coord, FrameStats, InactiveRule, Mask512,
+    ROOT_DIM, ValueRange,
+};
+
+/// Whether bricks keep their active masks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub enum MaskPolicy {
+    /// Always.
+    Keep,
+    /// Not where every inactive voxel is background: the texels carry the background then, and a
+    /// voxel is active where its value is something else.
+    DropWhereBackground,
+    /// The same, but only where the background is 0, as it is for fog: another one is not a value that
+    /// texels give back exactly.
+    DropFog,
+}
+
+/// One frame of one grid without its voxels.
+#[derive(Clone, Serialize, Deserialize)]
+pub struct Outline {
+    /// The value outside everything.
+    pub background: f32,
+    /// Constant 4096³ regions.
+    pub roots: Vec<(Coord, Constant)>,
+    /// The cells that are not all background, ascending by origin.
+    pub cells: Vec<Cell>,
+    /// The bricks that the cells name, in the order in which they name them.
+    pub bricks: Vec<BrickOutline>,
+    /// The source's counts.
+    pub stats: FrameStats,
+}
+
+/// A brick without its voxels: what can be found out about it without knowing the others.
+#[derive(Clone, Serialize, Deserialize)]
+pub struct BrickOutline {
+    /// Which voxels of the source are active.
+    pub active: Mask512,
+    /// Whether that has to be kept.
+    pub keeps_mask: bool,
+    /// What its inactive voxels are.
+    pub rule: InactiveRule,
+    /// For [`InactiveRule::Sign`], those at minus the background.
+    pub minus: Option<Mask512>,
+    /// What its other voxels are.
+    pub values: Values,
+}
+
+/// The voxels of a brick that its texels have to give.
+#[derive(Clone, Copy, Serialize, Deserialize)]
+pub enum Values {
+    /// All the same, bit by bit.
+    Constant(f32),
+    /// Their range, and the [`BrickPool::digest`] of the brick.
+    Varied(ValueRange, [u8; 32]),
+}
+
+impl Outline {
+    /// Takes the voxels away from a frame: gives them apart, each brick with whether it keeps its mask.
+    pub fn split(flat: Flattened, policy: MaskPolicy) -> (Self, Vec<Brick>) {
+        let Flattened { frame, background } = flat;
+        let mut voxels = frame.bricks;
+        let bricks = voxels.par_iter_mut().map(|b| BrickOutline::new(b, background, policy)).collect();
+        let outline = Self { background, roots: frame.roots, cells: frame.cells, bricks, stats: frame.stats };
+        (outline, voxels)
+    }
+
+    /// Whether what it says is of one piece: a frame that was read is, and what comes from elsewhere has to be looked
+    /// at.
+    pub fn is_sound(&self) -> bool {
+        let mut next = 0;
+        self.cells.iter().all(|cell| match &cell.content {
+            CellContent::Constant(_) => true,
+            CellContent::Node(children) => {
+                let in_order = children.is_sorted_by(|a, b| a.0 < b.0);
+                let mut places = children.iter().filter_map(|(_, child)| match child {
+                    Child::Brick(place) => Some(*place),
+                    Child::Constant(_) => None,
+                });
+                let numbered = places.all(|place| {
+                    next += 1;
+                    place == next - 1
+                });
+                in_order && numbered && children.last().is_none_or(|(place, _)| *place < 4096)
+            }
+        }) && next as usize == self.bricks.len()
+            && self.cells.is_sorted_by(|a, b| a.origin < b.origin)
+            && self.cells.iter().all(|cell| cell.origin.is_aligned(CELL_DIM))
+            && self.roots.iter().all(|(origin, _)| origin.is_aligned(ROOT_DIM))
+    }
+
+    /// Whether there is nothing in it.
+    pub(super) fn is_empty(&self) -> bool {
+        self.roots.is_empty() && self.cells.is_empty()
+    }
+}
+
+impl BrickOutline {
+    fn new(brick: &mut Brick, background: f32, policy: MaskPolicy) -> Self {
+        let (rule, minus) = brick.inactive_rule(background);
+        let drop = match policy {
+            MaskPolicy::Keep => false,
+            MaskPolicy::DropWhereBackground => true,
+            MaskPolicy::DropFog => background == 0.0,
+        };
+        brick.keeps_mask = !(drop && rule == InactiveRule::Background);
+        let rule = if brick.keeps_mask { rule } else { InactiveRule::Texel };
+        let minus = (rule == InactiveRule::Sign).then_some(minus);
+        let values = values(brick, &carried(&brick.active, rule), background);
+        Self { active: brick.active, keeps_mask: brick.keeps_mask, rule, minus, values }
+    }
+}
+
+fn values(brick: &Brick, carried: &Mask512, background: f32) -> Values {
+    let Some((min, max)) = brick.range_over(carried) else { return Values::Constant(background) };
+    let mut bits = carried.ones().map(|i| brick.values[i].to_bits());
+    // 0 and −0 compare equal but are not the same bits.
+    let first = bits.next();
+    if min == max && bits.all(|b| Some(b) == first) {
+        return Values::Constant(first.map_or(background, f32::from_bits));
+    }
+    Values::Varied(ValueRange { min, max }, BrickPool::digest(brick))
+}
+
+/// The voxels whose values texels have to give: all but those that a rule gives.
+pub fn carried(active: &Mask512, rule: InactiveRule) -> Mask512 {
+    match rule {
+        InactiveRule::Background | InactiveRule::MinusBackground | InactiveRule::Sign => *active,
+        InactiveRule::Texel => Mask512::ALL,
+    }
+}

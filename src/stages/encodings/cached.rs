@@ -1,0 +1,285 @@
+//! What earlier builds made of a frame's bricks.
+//!
+//! One entry for each batch (a frame's bricks, at most [`BATCH_BRICKS`] of them) and kind. An entry grows: what a later
+//! build asks for is added to it, and nothing in it is made again.
+
+use std::collections::BTreeSet;
+use std::io;
+use std::ops::Range;
+use std::sync::Arc;
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::{Cost, Encodings, Kind, Made, Plain, Terms, Tried};
+use crate::cache::{Cache, Key, Stage};
+use crate::codec::{SequenceRange, encoder_isa};
+use crate::stages::dedup::SequenceTree;
+
+/// Bricks of a batch: with 512 bytes of texels each, an entry of a megabyte.
+pub const BATCH_BRICKS: u32 = 2048;
+
+const STAGE: Stage = Stage { name: "encode", version: 1 };
+
+/// Where the results of one grid's frames are kept.
+#[derive(Clone)]
+pub struct GridCache {
+    /// The store.
+    pub cache: Arc<Cache>,
+    /// For each frame of the grid, the key of its outline.
+    pub frames: Vec<Key>,
+}
+
+/// Some bricks of one frame.
+pub struct Batch {
+    /// What stands for the frame and the batch's place in it; `None` where nothing is cached.
+    pub key: Option<Key>,
+    /// The bricks of the pool that the frame had first and that are in this part of it.
+    pub ids: Range<u32>,
+    /// Whether the entries of each kind were looked for, and whether they lack something.
+    states: [State; KINDS],
+}
+
+/// [`Kind::Plain`] and three codecs.
+const KINDS: usize = 4;
+
+#[derive(Clone, Copy, Default)]
+struct State {
+    is_loaded: bool,
+    is_changed: bool,
+}
+
+/// The batches of a grid, in the order of its pool.
+pub(super) struct Batches {
+    pub all: Vec<Batch>,
+    cache: Option<GridCache>,
+}
+
+/// What lies in the cache: bricks by their places in the frame, ascending.
+#[derive(Default, Serialize, Deserialize)]
+struct Entry {
+    places: Vec<u32>,
+    plain: Vec<Plain>,
+    costs: Vec<Cost>,
+    #[serde(with = "serde_bytes")]
+    axes: Vec<u8>,
+    #[serde(with = "serde_bytes")]
+    bytes: Vec<u8>,
+}
+
+impl Kind {
+    fn index(self) -> usize {
+        match self {
+            Self::Plain => 0,
+            Self::Texels(codec) => 1 + codec as usize,
+        }
+    }
+
+    /// Bytes of texels of a brick.
+    fn size(self) -> usize {
+        match self {
+            Self::Plain => 0,
+            Self::Texels(codec) => codec.codec().layout().brick_bytes(),
+        }
+    }
+
+    const ALL: [Self; KINDS] = [
+        Self::Plain,
+        Self::Texels(super::KeptCodec::Bc7),
+        Self::Texels(super::KeptCodec::Bc4),
+        Self::Texels(super::KeptCodec::Unorm8),
+    ];
+}
+
+impl Batch {
+    fn key(&self, kind: Kind) -> Option<Key> {
+        // The blocks of intel_tex_2 depend on what the machine can do.
+        let isa = (kind == Kind::Texels(super::KeptCodec::Bc7)).then(encoder_isa);
+        self.key.map(|key| Key::new(&STAGE, &(key.digest(), kind, isa)))
+    }
+}
+
+impl Batches {
+    pub fn new(
+        tree: &SequenceTree,
+        cache: Option<GridCache>,
+        sequence: &SequenceRange,
+        terms: &Terms,
+    ) -> Self {
+        let mut all = Vec::new();
+        for (frame, own) in tree.own_bricks.iter().enumerate() {
+            let own: Vec<u32> = own.clone().collect();
+            let part = |id: &u32| tree.pool.home(*id).brick / BATCH_BRICKS;
+            for ids in own.chunk_by(|a, b| part(a) == part(b)) {
+                let key = cache.as_ref().map(|cache| {
+                    let outline = cache.frames[frame].digest();
+                    let range = [sequence.lo, sequence.span].map(f32::to_bits);
+                    Key::new(&STAGE, &(outline, part(&ids[0]), range, terms))
+                });
+                all.push(Batch { key, ids: ids[0]..ids[ids.len() - 1] + 1, states: Default::default() });
+            }
+        }
+        Self { all, cache }
+    }
+
+    /// The batches that some bricks, ascending, are in.
+    fn of(&self, ids: &[u32]) -> BTreeSet<usize> {
+        ids.iter().map(|id| self.all.partition_point(|batch| batch.ids.end <= *id)).collect()
+    }
+
+    /// Notes that bricks were made that the cache does not have.
+    pub fn mark(&mut self, tree: &SequenceTree, ids: &[u32], kind: Kind) {
+        if self.cache.is_some() {
+            let kept: Vec<u32> = ids.iter().copied().filter(|&id| !tree.pool.is_widened(id)).collect();
+            self.of(&kept).into_iter().for_each(|b| self.all[b].states[kind.index()].is_changed = true);
+        }
+    }
+}
+
+impl Entry {
+    fn is_sound(&self, kind: Kind) -> bool {
+        let count = self.places.len();
+        let lengths = [self.plain.len(), self.costs.len(), self.axes.len()];
+        let expected = if kind == Kind::Plain { [count, 0, 0] } else { [0, count, count] };
+        lengths == expected
+            && self.bytes.len() == count * kind.size()
+            && self.places.is_sorted_by(|a, b| a < b)
+            && self.axes.iter().all(|axis| *axis < 3)
+    }
+
+    /// The brick at a place of the frame.
+    fn find(&self, place: u32) -> Option<usize> {
+        self.places.binary_search(&place).ok()
+    }
+
+    fn push_from(&mut self, other: &Self, i: usize, size: usize) {
+        self.places.push(other.places[i]);
+        self.plain.extend(other.plain.get(i));
+        self.costs.extend(other.costs.get(i));
+        self.axes.extend(other.axes.get(i));
+        self.bytes.extend(&other.bytes[i * size..(i + 1) * size]);
+    }
+
+    /// What is in either; of what is in both, this one's.
+    fn union(self, other: &Self, kind: Kind) -> Self {
+        let size = kind.size();
+        let mut all = Self::default();
+        let (mut i, mut j) = (0, 0);
+        while i < self.places.len() || j < other.places.len() {
+            let (a, b) = (self.places.get(i), other.places.get(j));
+            if a.is_some_and(|a| b.is_none_or(|b| a <= b)) {
+                j += usize::from(a == b);
+                all.push_from(&self, i, size);
+                i += 1;
+            } else {
+                all.push_from(other, j, size);
+                j += 1;
+            }
+        }
+        all
+    }
+}
+
+impl Encodings {
+    /// The cache, if there is one.
+    pub fn cache(&self) -> Option<&Cache> {
+        self.batches.cache.as_ref().map(|c| &*c.cache)
+    }
+
+    /// The parts in which bricks are cached, in the order of the pool.
+    pub fn batches(&self) -> &[Batch] {
+        &self.batches.all
+    }
+
+    /// Takes from the cache what it has of the batches that some bricks, ascending, are in.
+    pub(super) fn load(&mut self, tree: &SequenceTree, ids: &[u32], kinds: &[Kind]) -> io::Result<()> {
+        let Some(GridCache { cache, .. }) = self.batches.cache.clone() else { return Ok(()) };
+        let mut wanted = Vec::new();
+        for batch in self.batches.of(ids) {
+            for &kind in kinds {
+                let state = &mut self.batches.all[batch].states[kind.index()];
+                if !std::mem::replace(&mut state.is_loaded, true) {
+                    wanted.push((batch, kind));
+                }
+            }
+        }
+        // Some at a time, since an entry is a megabyte.
+        for wanted in wanted.chunks(64) {
+            let entries: Vec<Option<Entry>> = wanted
+                .par_iter()
+                .map(|&(batch, kind)| {
+                    let key = self.batches.all[batch].key(kind)?;
+                    cache.get::<Entry>(&key).filter(|entry| entry.is_sound(kind))
+                })
+                .collect();
+            for (&(batch, kind), entry) in wanted.iter().zip(entries) {
+                if let Some(entry) = entry {
+                    self.take(tree, batch, kind, &entry)?;
+                }
+            }
+        }
+        Ok(())
+    }
+
+    fn take(&mut self, tree: &SequenceTree, batch: usize, kind: Kind, entry: &Entry) -> io::Result<()> {
+        let (mut ids, mut found) = (Vec::new(), Entry::default());
+        for id in self.batches.all[batch].ids.clone() {
+            // The active voxels of these are those of other frames too.
+            if tree.pool.is_widened(id) {
+                continue;
+            }
+            if let Some(i) = entry.find(tree.pool.home(id).brick) {
+                ids.push(id);
+                found.push_from(entry, i, kind.size());
+            }
+        }
+        let made = match kind {
+            Kind::Plain => Made::Plain(found.plain),
+            Kind::Texels(_) => {
+                Made::Texels(Tried { costs: found.costs, bytes: found.bytes, axes: found.axes })
+            }
+        };
+        self.keep(&ids, kind, made)
+    }
+
+    /// Keeps what was made and the cache does not have yet.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be read back.
+    pub fn save(&mut self, tree: &SequenceTree) -> io::Result<()> {
+        let Some(GridCache { cache, .. }) = self.batches.cache.clone() else { return Ok(()) };
+        for b in 0..self.batches.all.len() {
+            for kind in Kind::ALL {
+                let batch = &mut self.batches.all[b];
+                if !std::mem::take(&mut batch.states[kind.index()].is_changed) {
+                    continue;
+                }
+                let (ids, key) = (batch.ids.clone(), batch.key(kind).expect("what is cached has a key"));
+                let known: Vec<u32> =
+                    ids.filter(|&id| !tree.pool.is_widened(id) && self.is_known(id, kind)).collect();
+                let entry = self.entry(tree, &known, kind)?;
+                // Another build may have asked for other bricks of the frame.
+                let others = cache.get::<Entry>(&key).filter(|entry| entry.is_sound(kind));
+                cache.put(&key, &entry.union(&others.unwrap_or_default(), kind));
+            }
+        }
+        self.saved = std::time::Instant::now();
+        Ok(())
+    }
+
+    fn entry(&mut self, tree: &SequenceTree, ids: &[u32], kind: Kind) -> io::Result<Entry> {
+        let mut entry =
+            Entry { places: ids.iter().map(|&id| tree.pool.home(id).brick).collect(), ..Entry::default() };
+        match kind {
+            Kind::Plain => entry.plain = ids.iter().map(|&id| *self.plain(id)).collect(),
+            Kind::Texels(codec) => {
+                entry.costs = ids.iter().filter_map(|&id| self.cost(id, codec)).collect();
+                for (bytes, axis) in self.texels(ids, codec)? {
+                    entry.bytes.extend(bytes);
+                    entry.axes.push(axis);
+                }
+            }
+        }
+        Ok(entry)
+    }
+}

@@ -1,0 +1,59 @@
+//! How far decoded values are from a brick's.
+
+use super::Cost;
+use crate::volume::{BRICK_VOXELS, Brick, Mask512};
+
+/// Sums that run side by side: the order of adding is fixed, and a compiler may use vectors.
+const LANES: usize = 8;
+
+/// A brick to which decoded values are compared.
+pub(super) struct Measure<'a> {
+    brick: &'a Brick,
+    carried: &'a Mask512,
+    sign_matters: Option<f64>,
+}
+
+impl<'a> Measure<'a> {
+    /// `carried` are the voxels that texels give; `sign_matters` says of level sets from what distance on a voxel must
+    /// not change sides.
+    pub fn new(brick: &'a Brick, carried: &'a Mask512, sign_matters: Option<f64>) -> Self {
+        Self { brick, carried, sign_matters }
+    }
+
+    /// What `decoded` costs, and what a GPU that is `spread` off at each voxel may read.
+    pub fn of(&self, decoded: &[f32; BRICK_VOXELS], spread: Option<&[f32; BRICK_VOXELS]>) -> Cost {
+        let (mut squares, mut active, mut max) = ([0.0f64; LANES], [0.0f64; LANES], [0.0f64; LANES]);
+        for at in (0..BRICK_VOXELS).step_by(LANES) {
+            let bits = |mask: &Mask512| mask.0[at >> 6] >> (at & 63);
+            let (carried_bits, active_bits) = (bits(self.carried), bits(&self.brick.active));
+            for lane in 0..LANES {
+                let i = at + lane;
+                let is_carried = (carried_bits >> lane & 1) as f64;
+                let error = (f64::from(decoded[i]) - f64::from(self.brick.values[i])).abs() * is_carried;
+                let spread = spread.map_or(0.0, |s| f64::from(s[i])) * is_carried;
+                squares[lane] += error * error;
+                active[lane] += error * error * (active_bits >> lane & 1) as f64;
+                max[lane] = max[lane].max(error + spread);
+            }
+        }
+        if let Some(distance) = self.sign_matters {
+            let values = &self.brick.values;
+            let flips =
+                |i: usize| (decoded[i] < 0.0) != (values[i] < 0.0) && f64::from(values[i]).abs() > distance;
+            if self.carried.ones().any(flips) {
+                return Cost::IMPOSSIBLE;
+            }
+        }
+        let max = max.into_iter().fold(0.0, f64::max);
+        // Rounded up, because a bound is what it is compared with.
+        let max = if f64::from(max as f32) < max { (max as f32).next_up() } else { max as f32 };
+        let root = |lanes: [f64; LANES]| lanes.iter().sum::<f64>().sqrt();
+        Cost { norm: root(squares), active_norm: root(active), max }
+    }
+}
+
+/// The mean of the voxels that texels would give.
+pub(super) fn mean(brick: &Brick, carried: &Mask512) -> f32 {
+    let sum: f64 = carried.ones().map(|i| f64::from(brick.values[i])).sum();
+    (sum / f64::from(carried.count().max(1))) as f32
+}

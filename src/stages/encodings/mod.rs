@@ -1,0 +1,314 @@
+//! Stages 5 and 7: what each codec makes of each brick, measured on decoded values. Made once: what was tried to
+//! choose a codec is what goes into the pack, and what an earlier build made is taken from the cache.
+
+mod cached;
+mod kept;
+mod measure;
+
+use std::io;
+use std::time::{Duration, Instant};
+
+use half::f16;
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use super::dedup::{SequenceTree, carried};
+use crate::codec::{BATCH, BrickRange, Codec, SequenceRange, Texels, decode, encode, spread};
+use crate::settings::RangeMode;
+use crate::volume::{BRICK_VOXELS, BRICKS_IN_FLIGHT, Brick, InactiveRule, Mask512};
+use cached::Batches;
+pub use cached::{Batch, GridCache};
+use kept::KeptTexels;
+use measure::Measure;
+
+/// What one codec does to one brick.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Cost {
+    /// Root of the squared error over the voxels that texels give; infinite where the codec is out of the
+    /// question.
+    pub norm: f64,
+    /// The same over active voxels.
+    pub active_norm: f64,
+    /// The largest error that an engine can read, on any GPU.
+    pub max: f32,
+}
+
+impl Cost {
+    /// No error at all.
+    pub const NONE: Self = Self { norm: 0.0, active_norm: 0.0, max: 0.0 };
+    /// More error than any.
+    pub const IMPOSSIBLE: Self = Self { norm: f64::INFINITY, active_norm: f64::INFINITY, max: f32::INFINITY };
+    const UNKNOWN: Self = Self { norm: f64::NAN, active_norm: f64::NAN, max: f32::NAN };
+
+    fn is_known(&self) -> bool {
+        !self.norm.is_nan()
+    }
+}
+
+/// What a constant brick's value keeps small.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+pub enum ConstantAim {
+    /// The squared error: it is the mean.
+    Squares,
+    /// The largest error: it is the middle of the range.
+    Max,
+}
+
+/// A brick without texels, or with raw ones: what can be said of it without keeping a byte.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Plain {
+    /// What it would be as a constant.
+    pub value: f32,
+    /// As that constant.
+    pub constant: Cost,
+    /// As background, without a record.
+    pub empty: Cost,
+    /// As half floats.
+    pub f16: Cost,
+}
+
+impl Plain {
+    const UNKNOWN: Self =
+        Self { value: f32::NAN, constant: Cost::UNKNOWN, empty: Cost::UNKNOWN, f16: Cost::UNKNOWN };
+}
+
+/// What is made of bricks and kept.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum Kind {
+    /// [`Plain`].
+    Plain,
+    /// Texels of a codec whose texels are fractions of a range.
+    Texels(KeptCodec),
+}
+
+/// The codecs whose texels are kept. Raw ones take as much to keep as to make.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub enum KeptCodec {
+    /// BC7.
+    Bc7,
+    /// BC4.
+    Bc4,
+    /// 8-bit fractions.
+    Unorm8,
+}
+
+impl KeptCodec {
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::Bc7, Self::Bc4, Self::Unorm8];
+
+    /// The kept one of all codecs.
+    pub fn of(codec: Codec) -> Option<Self> {
+        Self::ALL.into_iter().find(|kept| kept.codec() == codec)
+    }
+
+    /// As one of all codecs.
+    pub fn codec(self) -> Codec {
+        match self {
+            Self::Bc7 => Codec::Bc7,
+            Self::Bc4 => Codec::Bc4,
+            Self::Unorm8 => Codec::Unorm8,
+        }
+    }
+}
+
+/// What the error of a grid's bricks depends on beside the bricks.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Terms {
+    /// What texels are fractions of.
+    pub range: RangeMode,
+    /// What a constant's value keeps small.
+    pub aim: ConstantAim,
+    /// Level sets: a voxel further from the surface than this must not change sides.
+    pub sign_matters: Option<f64>,
+}
+
+/// How long a build may go on before what it made is kept, so that one that is killed loses no more than that.
+const SAVE_EVERY: Duration = Duration::from_secs(2);
+
+/// What each codec does to each brick of a grid, as far as someone asked.
+pub struct Encodings {
+    /// The range that brick ranges are fractions of.
+    pub sequence: SequenceRange,
+    /// The range of each brick of the pool.
+    pub ranges: Vec<BrickRange>,
+    terms: Terms,
+    rules: Vec<InactiveRule>,
+    plain: Vec<Plain>,
+    kept: [KeptTexels; KeptCodec::ALL.len()],
+    batches: Batches,
+    saved: Instant,
+}
+
+impl Encodings {
+    /// Nothing is tried yet. `None` when the sequence's values span more than an `f32` can hold. With a cache, what it
+    /// has is taken from there, and what is made goes into it.
+    pub fn new(tree: &SequenceTree, terms: Terms, cache: Option<GridCache>) -> Option<Self> {
+        let sequence = match tree.value_range() {
+            Some(range) => SequenceRange::around(range.min, range.max)?,
+            None => SequenceRange::default(),
+        };
+        let ranges: Vec<BrickRange> = match terms.range {
+            RangeMode::Sequence => vec![BrickRange::SEQUENCE; tree.brick_ranges.len()],
+            RangeMode::Brick => tree.brick_ranges.iter().map(|r| sequence.fit(r.min, r.max)).collect(),
+        };
+        let batches = Batches::new(tree, cache, &sequence, &terms);
+        Some(Self {
+            rules: tree.brick_rules(),
+            plain: Vec::new(),
+            kept: KeptCodec::ALL.map(|codec| KeptTexels::new(codec.codec())),
+            batches,
+            saved: Instant::now(),
+            sequence,
+            ranges,
+            terms,
+        })
+    }
+
+    /// What is known of a brick without texels; unknown costs are not numbers.
+    pub fn plain(&self, id: u32) -> &Plain {
+        self.plain.get(id as usize).unwrap_or(&Plain::UNKNOWN)
+    }
+
+    /// What a codec does to a brick; `None` while it has not been tried.
+    pub fn cost(&self, id: u32, codec: KeptCodec) -> Option<Cost> {
+        self.kept[codec as usize].cost(id)
+    }
+
+    /// The texels of some bricks in a codec that was tried on all of them, with their packing axes.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be read back.
+    pub fn texels(&mut self, ids: &[u32], codec: KeptCodec) -> io::Result<Vec<(Vec<u8>, u8)>> {
+        self.kept[codec as usize].read(ids)
+    }
+
+    /// Whether a brick's texels give all of its voxels.
+    pub fn is_whole(&self, id: u32) -> bool {
+        self.rules[id as usize] == InactiveRule::Texel
+    }
+
+    /// A brick as its texels shall be.
+    pub fn prepare(&self, tree: &SequenceTree, id: u32, brick: &Brick) -> Texels {
+        let (rule, range) = (self.rules[id as usize], tree.brick_ranges[id as usize]);
+        Texels::new(brick, carried(&brick.active, rule), (range.min, range.max), self.ranges[id as usize])
+    }
+
+    /// What decoded values cost a brick whose texels give the voxels in `carried`.
+    pub fn measure(&self, brick: &Brick, carried: &Mask512, decoded: &[f32; BRICK_VOXELS]) -> Cost {
+        Measure::new(brick, carried, self.terms.sign_matters).of(decoded, None)
+    }
+
+    fn is_known(&self, id: u32, kind: Kind) -> bool {
+        match kind {
+            Kind::Plain => self.plain(id).constant.is_known(),
+            Kind::Texels(codec) => self.cost(id, codec).is_some(),
+        }
+    }
+
+    /// Sees to it that some bricks, ascending, are known in every kind. `advance` hears of those that are done.
+    ///
+    /// # Errors
+    /// When bricks cannot be read, or the scratch file not be written.
+    pub fn make(
+        &mut self,
+        tree: &mut SequenceTree,
+        ids: &[u32],
+        kinds: &[Kind],
+        mut advance: impl FnMut(u64),
+    ) -> io::Result<()> {
+        self.load(tree, ids, kinds)?;
+        let mut bricks = Vec::new();
+        for window in ids.chunks(BRICKS_IN_FLIGHT as usize) {
+            let missing: Vec<u32> =
+                window.iter().copied().filter(|&id| kinds.iter().any(|k| !self.is_known(id, *k))).collect();
+            bricks.clear();
+            tree.read(&missing, &mut bricks)?;
+            let shared: &SequenceTree = tree;
+            let made: Vec<Vec<Made>> = missing
+                .par_chunks(BATCH)
+                .zip(bricks.par_chunks(BATCH))
+                .map(|(ids, bricks)| self.make_batch(shared, ids, bricks, kinds))
+                .collect();
+            for (ids, made) in missing.chunks(BATCH).zip(made) {
+                for (made, &kind) in made.into_iter().zip(kinds) {
+                    self.keep(ids, kind, made)?;
+                }
+            }
+            for &kind in kinds {
+                self.batches.mark(tree, &missing, kind);
+            }
+            if self.saved.elapsed() > SAVE_EVERY {
+                self.save(tree)?;
+            }
+            advance(window.len() as u64);
+        }
+        Ok(())
+    }
+
+    fn make_batch(&self, tree: &SequenceTree, ids: &[u32], bricks: &[Brick], kinds: &[Kind]) -> Vec<Made> {
+        let texels: Vec<Texels> = ids.iter().zip(bricks).map(|(&id, b)| self.prepare(tree, id, b)).collect();
+        let each = || ids.iter().zip(bricks).zip(&texels);
+        let made = |kind: &Kind| match *kind {
+            Kind::Plain => Made::Plain(each().map(|((&id, b), t)| self.make_plain(tree, id, b, t)).collect()),
+            Kind::Texels(codec) => Made::Texels(self.make_texels(codec.codec(), bricks, &texels)),
+        };
+        kinds.iter().map(made).collect()
+    }
+
+    fn make_plain(&self, tree: &SequenceTree, id: u32, brick: &Brick, texels: &Texels) -> Plain {
+        let range = tree.brick_ranges[id as usize];
+        let value = match self.terms.aim {
+            ConstantAim::Squares => measure::mean(brick, &texels.carried),
+            ConstantAim::Max => f64::midpoint(range.min.into(), range.max.into()) as f32,
+        };
+        let measure = Measure::new(brick, &texels.carried, self.terms.sign_matters);
+        // Values just past the greatest half would round to it, but the codec refuses them.
+        let f16 = match brick.values.iter().all(|v| v.abs() <= f16::MAX.to_f32()) {
+            true => measure.of(&brick.values.map(|v| f16::from_f32(v).to_f32()), None),
+            false => Cost::IMPOSSIBLE,
+        };
+        // Only where nothing but values says what is active may background stand for them.
+        let empty = match brick.keeps_mask {
+            true => Cost::IMPOSSIBLE,
+            false => measure.of(&[tree.background; BRICK_VOXELS], None),
+        };
+        Plain { value, constant: measure.of(&[value; BRICK_VOXELS], None), empty, f16 }
+    }
+
+    fn make_texels(&self, codec: Codec, bricks: &[Brick], texels: &[Texels]) -> Tried {
+        let encoded = encode(codec, &self.sequence, texels).expect("only f16 has values that it cannot hold");
+        let size = codec.layout().brick_bytes();
+        let each = bricks.iter().zip(texels).zip(encoded.bytes.chunks_exact(size)).zip(&encoded.axes);
+        let cost = |(((brick, texels), bytes), &axis): (((&Brick, &Texels), &[u8]), &u8)| {
+            let decoded = decode(codec, bytes, axis, &self.sequence, texels.range);
+            let spread = spread(codec, bytes, &self.sequence, texels.range);
+            Measure::new(brick, &texels.carried, self.terms.sign_matters).of(&decoded, Some(&spread))
+        };
+        Tried { costs: each.map(cost).collect(), bytes: encoded.bytes, axes: encoded.axes }
+    }
+
+    fn keep(&mut self, ids: &[u32], kind: Kind, made: Made) -> io::Result<()> {
+        match (kind, made) {
+            (Kind::Texels(codec), Made::Texels(tried)) => self.kept[codec as usize].add(ids, &tried),
+            (_, Made::Plain(plain)) => {
+                self.plain.resize(self.rules.len(), Plain::UNKNOWN);
+                ids.iter().zip(plain).for_each(|(&id, plain)| self.plain[id as usize] = plain);
+                Ok(())
+            }
+            (Kind::Plain, Made::Texels(_)) => unreachable!("plain bricks have no texels"),
+        }
+    }
+}
+
+/// What was made of a batch, in the order of its bricks.
+enum Made {
+    Plain(Vec<Plain>),
+    Texels(Tried),
+}
+
+/// A batch that one codec was tried on.
+struct Tried {
+    costs: Vec<Cost>,
+    bytes: Vec<u8>,
+    axes: Vec<u8>,
+}
