@@ -2,7 +2,7 @@
 
 use std::io;
 use std::sync::Mutex;
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::thread::JoinHandle;
 
 use super::lock;
@@ -17,8 +17,14 @@ pub(super) struct Writer {
 }
 
 struct Running {
-    sender: SyncSender<(Map, [u8; 32], Vec<u8>)>,
+    sender: SyncSender<Waiting>,
     handle: JoinHandle<io::Result<()>>,
+}
+
+struct Waiting {
+    map: Map,
+    digest: [u8; 32],
+    bytes: Vec<u8>,
 }
 
 impl Writer {
@@ -31,7 +37,7 @@ impl Writer {
         let sender =
             lock(&self.thread).get_or_insert_with(|| Running::new(self.store.clone())).sender.clone();
         // A writer that gave up hears of nothing more.
-        let _ = sender.send((map, digest, bytes));
+        let _ = sender.send(Waiting { map, digest, bytes });
     }
 
     /// Waits until all is written; the first failure, if any.
@@ -50,9 +56,8 @@ impl Drop for Writer {
 
 impl Running {
     fn new(store: Store) -> Self {
-        let (sender, receiver): (_, Receiver<(Map, [u8; 32], Vec<u8>)>) = sync_channel(WAITING);
-        let write =
-            move || receiver.iter().try_for_each(|(map, digest, bytes)| store.write(map, &digest, &bytes));
+        let (sender, receiver) = sync_channel::<Waiting>(WAITING);
+        let write = move || receiver.iter().try_for_each(|w| store.write(w.map, &w.digest, &w.bytes));
         Self { sender, handle: std::thread::spawn(write) }
     }
 }

@@ -59,7 +59,7 @@ struct Common {
 #[derive(Subcommand)]
 enum Command {
     /// Build packs from a manifest, or one pack from files
-    Build(build::BuildArgs),
+    Build(Box<build::BuildArgs>),
     /// Look after what builds keep
     Cache(cache::Arguments),
     /// Find the sequences in a folder and write a manifest for them

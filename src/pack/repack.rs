@@ -1,6 +1,5 @@
 //! The same pack at another level of zstd.
 
-use std::io;
 use std::path::Path;
 
 use rayon::prelude::*;
@@ -55,7 +54,7 @@ pub fn repack(
                     Ok(compress_chunk(raw, spec.encoding, level)?)
                 })
                 .collect::<Result<_, PackError>>()?;
-            packed.iter().try_for_each(|chunk| writer.chunk(chunk)).map_err(io::Error::from)?;
+            packed.iter().try_for_each(|chunk| writer.chunk(chunk))?;
         }
     }
     Ok(writer.finish()?)

@@ -9,6 +9,7 @@
 //! one after.
 
 use std::collections::BTreeMap;
+use std::collections::btree_map::Entry;
 use std::io;
 use std::ops::Range;
 
@@ -171,8 +172,8 @@ impl Near {
     ) -> io::Result<()> {
         self.batches.retain(|batch, _| around.contains(batch));
         for batch in around.clone() {
-            if !self.batches.contains_key(&batch) {
-                self.batches.insert(batch, decoded(encodings, lenders[batch])?);
+            if let Entry::Vacant(place) = self.batches.entry(batch) {
+                place.insert(decoded(encodings, lenders[batch])?);
             }
         }
         Ok(())
@@ -189,8 +190,7 @@ fn decoded(encodings: &mut Encodings, lenders: &[(u32, KeptCodec)]) -> io::Resul
         }
     }
     let encodings = &*encodings;
-    let lender = |(&(id, codec), kept): (&(u32, KeptCodec), Option<(Vec<u8>, u8)>)| {
-        let (bytes, axis) = kept.expect("every lender is of one of the codecs");
+    let lender = |id: u32, codec: KeptCodec, (bytes, axis): (Vec<u8>, u8)| {
         let texels = decode(codec.codec(), &bytes, axis, &SequenceRange::default(), BrickRange::SEQUENCE);
         let (mean, energy) = moments(&texels);
         let extent = encodings.ranges[id as usize].extent.to_f64() * f64::from(encodings.sequence.span);
@@ -198,7 +198,10 @@ fn decoded(encodings: &mut Encodings, lenders: &[(u32, KeptCodec)]) -> io::Resul
         let trust = (1.0 - (norm / extent).powi(2) / energy.max(f64::MIN_POSITIVE)).max(0.0).sqrt();
         Lender { texels, mean, energy, trust }
     };
-    Ok(lenders.par_iter().zip(texels).map(lender).collect())
+    let each = lenders.par_iter().zip(texels);
+    Ok(each
+        .map(|(&(id, codec), kept)| lender(id, codec, kept.expect("every lender is of one of the codecs")))
+        .collect())
 }
 
 /// Mean, and sum of squared differences from it.
