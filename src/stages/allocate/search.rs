@@ -7,6 +7,7 @@
 //! chooses it is tried and the search goes on with what was found.
 
 use std::io;
+use std::sync::LazyLock;
 
 use rayon::prelude::*;
 
@@ -27,11 +28,22 @@ const FIRST_OCTAVE: f64 = 24.0;
 const LAST_STEP: u32 = 100 * STEPS_PER_OCTAVE;
 
 fn lambda(step: u32) -> f64 {
-    if step >= LAST_STEP {
-        0.0
-    } else {
-        (FIRST_OCTAVE - f64::from(step) / f64::from(STEPS_PER_OCTAVE)).exp2()
-    }
+    static STEPS: LazyLock<Vec<f64>> = LazyLock::new(|| {
+        let octave = |step| FIRST_OCTAVE - f64::from(step) / f64::from(STEPS_PER_OCTAVE);
+        (0..LAST_STEP).map(|step| octave(step).exp2()).collect()
+    });
+    STEPS.get(step as usize).copied().unwrap_or(0.0)
+}
+
+/// What each rung comes to for a brick, by [`Rung::ALL`]. Looked up some hundred times a brick.
+#[derive(Clone, Copy)]
+struct Choices {
+    /// Squared peaks over all users and over all the voxels that texels give.
+    distortion: [f64; Rung::ALL.len()],
+    /// Squared error over active voxels.
+    active_squares: [f64; Rung::ALL.len()],
+    /// Texels and all records.
+    bits: [f64; Rung::ALL.len()],
 }
 
 /// Steps of λ, a quarter of an octave, that are one when it comes to who lends: 0.4 dB.
@@ -57,6 +69,10 @@ pub(super) struct GridSearch<'a> {
     pub(super) records: Vec<u32>,
     /// The coarsest step that each brick may have, for the sake of the frames it is in.
     pub(super) least_step: Vec<u32>,
+    choices: Vec<Choices>,
+    /// The bricks that this search asked for in BC7. A cache may know of more, but what it knows by chance must not
+    /// lead the search elsewhere.
+    bc7_is_tried: Vec<bool>,
     /// What each brick may borrow.
     loans: Vec<Option<Loan>>,
     /// The rung of bricks that lend their texels.
@@ -80,8 +96,11 @@ impl<'a> GridSearch<'a> {
             }
         }
         let peak = tree.active_range().map_or(0.0, ValueRange::width);
-        Self {
+        let none = [0.0; Rung::ALL.len()];
+        let mut search = Self {
+            choices: vec![Choices { distortion: none, active_squares: none, bits: none }; uses.len()],
             least_step: vec![0; uses.len()],
+            bc7_is_tried: vec![false; uses.len()],
             loans: vec![None; uses.len()],
             lends: vec![None; uses.len()],
             peak,
@@ -91,7 +110,28 @@ impl<'a> GridSearch<'a> {
             records,
             encodings: grid.encodings,
             tree,
+        };
+        (0..search.choices.len()).for_each(|brick| search.weigh(brick, &Rung::ALL));
+        search
+    }
+
+    /// Notes what some rungs come to for a brick.
+    fn weigh(&mut self, brick: usize, rungs: &[Rung]) {
+        for &rung in rungs {
+            let (i, cost) = (rung as usize, self.cost(brick, rung));
+            let texels = 8 * rung.codec().layout().brick_bytes() as u32;
+            let records = if rung == Rung::Empty { 0 } else { self.records[brick] };
+            let distortion = self.in_peaks(brick, cost.norm);
+            let choices = &mut self.choices[brick];
+            choices.distortion[i] = distortion;
+            choices.active_squares[i] = cost.active_norm.powi(2);
+            choices.bits[i] = f64::from(texels) + f64::from(RECORD_BITS) * f64::from(records);
         }
+    }
+
+    fn set_loan(&mut self, brick: usize, loan: Option<Loan>) {
+        self.loans[brick] = loan;
+        self.weigh(brick, &[Rung::Borrowed]);
     }
 
     /// The squared error that `voxels` may have together at some PSNR.
@@ -107,13 +147,14 @@ impl<'a> GridSearch<'a> {
     fn cost(&self, brick: usize, rung: Rung) -> Cost {
         match rung {
             Rung::Borrowed => self.loans[brick].map_or(Cost::IMPOSSIBLE, |loan| loan.cost),
+            Rung::Bc7 if !self.bc7_is_tried[brick] => Cost::NONE,
             rung => rung.cost(&self.encodings, brick as u32).unwrap_or(Cost::NONE),
         }
     }
 
     /// A brick's error in squared peaks, over all its users and over all the voxels that its texels give.
     fn distortion(&self, brick: usize, rung: Rung) -> f64 {
-        self.in_peaks(brick, self.cost(brick, rung).norm)
+        self.choices[brick].distortion[rung as usize]
     }
 
     fn in_peaks(&self, brick: usize, norm: f64) -> f64 {
@@ -123,14 +164,12 @@ impl<'a> GridSearch<'a> {
     }
 
     fn active_squares(&self, brick: usize, rung: Rung) -> f64 {
-        self.cost(brick, rung).active_norm.powi(2)
+        self.choices[brick].active_squares[rung as usize]
     }
 
     /// The bits of a brick's texels and of all its records.
     fn bits(&self, brick: usize, rung: Rung) -> f64 {
-        let texels = 8 * rung.codec().layout().brick_bytes() as u32;
-        let records = if rung == Rung::Empty { 0 } else { self.records[brick] };
-        f64::from(texels) + f64::from(RECORD_BITS) * f64::from(records)
+        self.choices[brick].bits[rung as usize]
     }
 
     /// The rung with the least D + λR; of equals the cheapest.
@@ -144,10 +183,15 @@ impl<'a> GridSearch<'a> {
             let possible = |rung: &Rung| self.cost(brick, *rung).norm.is_finite();
             return Rung::ALL.into_iter().find(possible).unwrap_or(Rung::F32);
         }
-        let lambda = lambda(step);
-        let cost = |rung: Rung| self.distortion(brick, rung) + lambda * self.bits(brick, rung);
-        let cheapest = Rung::ALL.into_iter().map(|rung| (rung, cost(rung)));
-        cheapest.reduce(|best, next| if next.1 < best.1 { next } else { best }).expect("there are rungs").0
+        let (lambda, Choices { distortion, bits, .. }) = (lambda(step), &self.choices[brick]);
+        let (mut best, mut least) = (Rung::F32, f64::INFINITY);
+        for rung in Rung::ALL {
+            let cost = distortion[rung as usize] + lambda * bits[rung as usize];
+            if cost < least {
+                (best, least) = (rung, cost);
+            }
+        }
+        best
     }
 
     pub(super) fn picks(&self, step: u32) -> Vec<Rung> {
@@ -166,9 +210,13 @@ impl<'a> GridSearch<'a> {
         picks: impl Iterator<Item = (u32, Rung)>,
         advance: &mut dyn FnMut(u64),
     ) -> io::Result<bool> {
-        let unknown = picks.filter(|&(id, rung)| rung.cost(&self.encodings, id).is_none());
+        let unknown = picks.filter(|&(id, rung)| rung == Rung::Bc7 && !self.bc7_is_tried[id as usize]);
         let unknown: Vec<u32> = unknown.map(|(id, _)| id).collect();
         self.encodings.make(self.tree, &unknown, &[Kind::Texels(KeptCodec::Bc7)], advance)?;
+        for &id in &unknown {
+            self.bc7_is_tried[id as usize] = true;
+            self.weigh(id as usize, &[Rung::Bc7]);
+        }
         Ok(!unknown.is_empty())
     }
 
@@ -281,7 +329,7 @@ impl<'a> GridSearch<'a> {
         for (_, id, loan) in order {
             let (id, lender) = (id as usize, loan.lender as usize);
             if self.loans[id].is_none() && self.lends[id].is_none() && self.loans[lender].is_none() {
-                self.loans[id] = Some(loan);
+                self.set_loan(id, Some(loan));
                 self.lends[lender] = Some(picks[lender]);
             }
         }
@@ -289,7 +337,7 @@ impl<'a> GridSearch<'a> {
     }
 
     pub(super) fn forget_loans(&mut self) {
-        self.loans.fill(None);
+        (0..self.loans.len()).for_each(|brick| self.set_loan(brick, None));
         self.lends.fill(None);
     }
 
@@ -381,12 +429,14 @@ impl<'a> GridSearch<'a> {
     /// Ends every loan that some bricks are part of: they are to become finer, and their texels others.
     fn call_in_loans(&mut self, bricks: &[u32]) {
         for &id in bricks {
-            self.loans[id as usize] = None;
+            self.set_loan(id as usize, None);
             self.lends[id as usize] = None;
         }
-        let lends = &self.lends;
-        let ended = |loan: &Loan| lends[loan.lender as usize].is_none();
-        self.loans.iter_mut().filter(|loan| loan.as_ref().is_some_and(ended)).for_each(|loan| *loan = None);
+        for brick in 0..self.loans.len() {
+            if self.loans[brick].is_some_and(|loan| self.lends[loan.lender as usize].is_none()) {
+                self.set_loan(brick, None);
+            }
+        }
     }
 
     pub(super) fn finish(self, picks: &[Rung]) -> io::Result<Allocation> {

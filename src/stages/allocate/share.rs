@@ -27,7 +27,7 @@ use crate::volume::{BRICK_VOXELS, Brick, Mask512};
 const STAGE: Stage = Stage { name: "share", version: 1 };
 
 /// Bricks to either side that a batch is compared with at least: in short frames those of a few.
-const LEAST_NEAR: usize = 256;
+const LEAST_NEAR: usize = 128;
 /// Rows of one product: 256 × 6,144 similarities are 6 MB.
 const ROWS: usize = 256;
 /// Lenders that are compared voxel by voxel.
