@@ -17,7 +17,7 @@ use crate::settings::ByteSize;
 #[derive(Args, Clone)]
 pub struct CacheArgs {
     /// Where what was made is kept for the next build [default: the platform's folder for caches]
-    #[arg(long = "cache", value_name = "DIR", env = "VOLPACK_CACHE", hide_env_values = true)]
+    #[arg(long = "cache", value_name = "DIR", env = "VOLPACK_CACHE", hide_env_values = true, global = true)]
     folder: Option<PathBuf>,
 }
 

@@ -3,6 +3,7 @@
 //! `cargo run --release -p xtask -- help` lists the tasks. None of them is part of the tests: they need
 //! peers from Debian (`libopenvdb-dev libboost-dev libtbb-dev libimath-dev g++`) or volumes of your own.
 
+mod cache;
 mod clusters;
 mod formats;
 mod kmeans;
@@ -13,6 +14,7 @@ mod pictures;
 mod read;
 mod sequence;
 mod size;
+mod stress;
 mod trace;
 
 use std::error::Error;
@@ -46,6 +48,8 @@ enum Task {
     },
     /// Run mutated files and packs through every reader, in 1 GiB of memory and 10 s each
     Mutate(mutate::Args),
+    /// Kill builds, damage the cache, run builds side by side: the packs must come out the same
+    StressCache(stress::Args),
     /// Read files once and print how long it took (what `bench read` runs)
     #[command(hide = true)]
     ReadOnce(read::OnceArgs),
@@ -55,6 +59,8 @@ enum Task {
 enum Bench {
     /// Reading time and memory beside OpenVDB's C++ io::File
     Read(read::Args),
+    /// Builds with a cache: cold, without a change, after an edit, at another quality, at another level of zstd
+    Cache(cache::Args),
     /// Every format and range on each volume: bytes, PSNR, largest error, seconds; and the tree beside
     /// the thesis's layout
     Formats(formats::Args),
@@ -73,6 +79,7 @@ enum Bench {
 fn main() -> Result<(), Box<dyn Error>> {
     match Cli::parse().task {
         Task::Bench(Bench::Read(args)) => read::bench(&args),
+        Task::Bench(Bench::Cache(args)) => cache::bench(&args),
         Task::Bench(Bench::Formats(args)) => formats::bench(&args),
         Task::Bench(Bench::Clusters(args)) => clusters::bench(&args),
         Task::Bench(Bench::Kmeans(args)) => kmeans::bench(&args),
@@ -81,6 +88,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         Task::Bench(Bench::Trace(args)) => trace::bench(&args),
         Task::Chart { json, svg } => chart(&json, &svg),
         Task::CheckOpenvdb { files } => openvdb::check(&files),
+        Task::StressCache(args) => stress::run(&args),
         Task::Mutate(args) => mutate::run(args),
         Task::ReadOnce(args) => read::once(&args),
     }

@@ -28,8 +28,8 @@ const STAGE: Stage = Stage { name: "share", version: 1 };
 
 /// Bricks to either side that a batch is compared with at least: in short frames those of a few.
 const LEAST_NEAR: usize = 128;
-/// Rows of one product: 256 × 6,144 similarities are 6 MB.
-const ROWS: usize = 256;
+/// Rows of one product: 64 × 6,144 similarities are 1.5 MB, and a frame has work for every core.
+const ROWS: usize = 64;
 /// Lenders that are compared voxel by voxel.
 const CLOSEST: usize = 3;
 /// Values of a shape as it is first compared: means of 2³ voxels.
@@ -60,8 +60,8 @@ struct Lender {
     mean: f64,
     /// Sum of squared differences from the mean.
     energy: f64,
-    /// The root of the part of its energy that is not its own error, which is stretched with it.
-    trust: f64,
+    /// Its shape as it is first compared.
+    coarse: [f32; COARSE],
 }
 
 /// For each of `borrowers`, ascending, the nearest of `lenders`, ascending, each with its codec: the closest first.
@@ -74,27 +74,26 @@ pub(super) fn loans(
     let batches = encodings.batches().len();
     let lenders_of: Vec<&[(u32, KeptCodec)]> =
         encodings.batches().iter().map(|batch| part(lenders, |lender| lender.0, &batch.ids)).collect();
+    let comparisons: Vec<Comparison> = (0..batches)
+        .map(|batch| {
+            let around = around(encodings.batches(), batch);
+            let borrowers = part(borrowers, |id| *id, &encodings.batches()[batch].ids);
+            Comparison { batch, borrowers, lenders: lenders_of[around.clone()].concat(), around }
+        })
+        .collect();
+    let known: Vec<(Option<Key>, Option<Vec<Vec<Offer>>>)> =
+        comparisons.par_iter().map(|comparison| comparison.known(encodings, tree)).collect();
+
     let mut near = Near::default();
     let mut found = Vec::with_capacity(borrowers.len());
-    for batch in 0..batches {
-        let around = around(encodings.batches(), batch);
-        let ids = part(borrowers, |id| *id, &encodings.batches()[batch].ids);
-        let compared: Vec<(u32, KeptCodec)> = lenders_of[around.clone()].concat();
-        let key = key(encodings, tree, batch, &around, ids, &compared);
-        let known = key.and_then(|key| encodings.cache()?.get::<Vec<Vec<Offer>>>(&key));
-        let is_sound = |offers: &Vec<Vec<Offer>>| {
-            let lenders = compared.len();
-            offers.len() == ids.len() && offers.iter().flatten().all(|o| (o.lender as usize) < lenders)
-        };
-        let offers = match known.filter(is_sound) {
+    for (comparison, (key, known)) in comparisons.iter().zip(known) {
+        let offers = match known {
             Some(offers) => offers,
             None => {
-                let mut bricks = Vec::with_capacity(ids.len());
-                tree.read(ids, &mut bricks)?;
-                near.move_to(encodings, &around, &lenders_of)?;
-                let lenders: Vec<&Lender> = near.batches.values().flatten().collect();
-                let compared: Vec<u32> = compared.iter().map(|(id, _)| *id).collect();
-                let offers = nearest(encodings, ids, &bricks, &compared, &lenders);
+                let mut bricks = Vec::with_capacity(comparison.borrowers.len());
+                tree.read(comparison.borrowers, &mut bricks)?;
+                near.move_to(encodings, &comparison.around, &lenders_of)?;
+                let offers = comparison.nearest(encodings, &bricks, &near);
                 if let Some((cache, key)) = encodings.cache().zip(key) {
                     cache.put(&key, &offers);
                 }
@@ -102,13 +101,53 @@ pub(super) fn loans(
             }
         };
         let loan = |offer: Offer| Loan {
-            lender: compared[offer.lender as usize].0,
+            lender: comparison.lenders[offer.lender as usize].0,
             range: BrickRange::from_word(offer.range),
             cost: offer.cost,
         };
         found.extend(offers.into_iter().map(|offers| offers.into_iter().map(loan).collect::<Vec<_>>()));
     }
     Ok(found)
+}
+
+/// The borrowers of a batch, and the lenders that they are compared with.
+struct Comparison<'a> {
+    batch: usize,
+    /// The batches that the lenders are in.
+    around: Range<usize>,
+    borrowers: &'a [u32],
+    lenders: Vec<(u32, KeptCodec)>,
+}
+
+impl Comparison<'_> {
+    /// What stands for the offers in the cache, and those that are there.
+    fn known(&self, encodings: &Encodings, tree: &SequenceTree) -> (Option<Key>, Option<Vec<Vec<Offer>>>) {
+        let key = self.key(encodings, tree);
+        let is_sound = |offers: &Vec<Vec<Offer>>| {
+            offers.len() == self.borrowers.len()
+                && offers.iter().flatten().all(|offer| (offer.lender as usize) < self.lenders.len())
+        };
+        (key, key.and_then(|key| encodings.cache()?.get(&key)).filter(is_sound))
+    }
+
+    /// What the offers depend on; `None` where nothing is cached.
+    fn key(&self, encodings: &Encodings, tree: &SequenceTree) -> Option<Key> {
+        // The active voxels of these are those of frames that no key here stands for.
+        let is_widened = |id: u32| tree.pool.is_widened(id);
+        if self.borrowers.iter().any(|&id| is_widened(id)) || self.lenders.iter().any(|l| is_widened(l.0)) {
+            return None;
+        }
+        let batches = &encodings.batches()[self.around.clone()];
+        let keys: Option<Vec<[u8; 32]>> = batches.iter().map(|b| b.key.map(|key| *key.digest())).collect();
+        let place = |id: u32| tree.pool.home(id).brick;
+        let borrowers: Vec<u32> = self.borrowers.iter().map(|&id| place(id)).collect();
+        // Places are told from each other by the batch that they are in.
+        let counts: Vec<usize> =
+            batches.iter().map(|batch| part(&self.lenders, |lender| lender.0, &batch.ids).len()).collect();
+        let lenders: Vec<(u32, KeptCodec)> =
+            self.lenders.iter().map(|&(id, codec)| (place(id), codec)).collect();
+        Some(Key::new(&STAGE, &(keys?, self.batch - self.around.start, borrowers, counts, lenders)))
+    }
 }
 
 /// The batches that a batch is compared with: itself, the one before, the one after, and more to either side until there
@@ -131,29 +170,6 @@ fn around(batches: &[Batch], batch: usize) -> Range<usize> {
 fn part<'a, T>(items: &'a [T], id: impl Fn(&T) -> u32, ids: &Range<u32>) -> &'a [T] {
     let at = |end: u32| items.partition_point(|item| id(item) < end);
     &items[at(ids.start)..at(ids.end)]
-}
-
-/// What the offers to a batch's borrowers depend on; `None` where nothing is cached.
-fn key(
-    encodings: &Encodings,
-    tree: &SequenceTree,
-    batch: usize,
-    around: &Range<usize>,
-    borrowers: &[u32],
-    lenders: &[(u32, KeptCodec)],
-) -> Option<Key> {
-    let batches = &encodings.batches()[around.clone()];
-    // The active voxels of these are those of frames that no key here stands for.
-    let is_widened = |id: u32| tree.pool.is_widened(id);
-    if borrowers.iter().any(|&id| is_widened(id)) || lenders.iter().any(|l| is_widened(l.0)) {
-        return None;
-    }
-    let keys: Option<Vec<[u8; 32]>> = batches.iter().map(|b| b.key.map(|key| *key.digest())).collect();
-    let place = |id: u32| tree.pool.home(id).brick;
-    let borrowers: Vec<u32> = borrowers.iter().map(|&id| place(id)).collect();
-    let lenders: Vec<(u32, KeptCodec)> = lenders.iter().map(|&(id, codec)| (place(id), codec)).collect();
-    let own = batch - around.start;
-    Some(Key::new(&STAGE, &(keys?, own, borrowers, lenders)))
 }
 
 /// The lenders of the batches that are being compared.
@@ -195,8 +211,11 @@ fn decoded(encodings: &mut Encodings, lenders: &[(u32, KeptCodec)]) -> io::Resul
         let (mean, energy) = moments(&texels);
         let extent = encodings.ranges[id as usize].extent.to_f64() * f64::from(encodings.sequence.span);
         let norm = encodings.cost(id, codec).map_or(0.0, |cost| cost.norm);
+        // The part of its energy that is its own error is stretched with it.
         let trust = (1.0 - (norm / extent).powi(2) / energy.max(f64::MIN_POSITIVE)).max(0.0).sqrt();
-        Lender { texels, mean, energy, trust }
+        let mut shape = [0.0; COARSE];
+        coarse(&texels, mean, energy, &mut shape);
+        Lender { texels, mean, energy, coarse: shape.map(|v| v * trust as f32) }
     };
     let each = lenders.par_iter().zip(texels);
     Ok(each
@@ -222,24 +241,16 @@ fn coarse(values: &[f32; BRICK_VOXELS], mean: f64, energy: f64, out: &mut [f32])
     out.iter_mut().for_each(|v| *v = ((f64::from(*v) - 8.0 * mean) * scale) as f32);
 }
 
-/// For each brick the closest of the lenders, whose numbers in the pool are `lender_ids`.
-fn nearest(
-    encodings: &Encodings,
-    ids: &[u32],
-    bricks: &[Brick],
-    lender_ids: &[u32],
-    lenders: &[&Lender],
-) -> Vec<Vec<Offer>> {
-    let mut codebook = Array2::<f32>::zeros((lenders.len(), COARSE));
-    for (lender, mut row) in lenders.iter().zip(codebook.rows_mut()) {
-        let row = row.as_slice_mut().expect("rows are contiguous");
-        coarse(&lender.texels, lender.mean, lender.energy, row);
-        row.iter_mut().for_each(|v| *v *= lender.trust as f32);
-    }
-    let codebook = codebook.t();
-    ids.par_chunks(ROWS)
-        .zip(bricks.par_chunks(ROWS))
-        .flat_map_iter(|(ids, bricks)| {
+impl Comparison<'_> {
+    /// For each borrower, whose bricks these are, the closest of the lenders.
+    fn nearest(&self, encodings: &Encodings, bricks: &[Brick], near: &Near) -> Vec<Vec<Offer>> {
+        let lenders: Vec<&Lender> = near.batches.values().flatten().collect();
+        let mut codebook = Array2::<f32>::zeros((lenders.len(), COARSE));
+        for (lender, mut row) in lenders.iter().zip(codebook.rows_mut()) {
+            row.as_slice_mut().expect("rows are contiguous").copy_from_slice(&lender.coarse);
+        }
+        let codebook = codebook.t();
+        let offers = |(ids, bricks): (&[u32], &[Brick])| {
             let mut shapes = Array2::<f32>::zeros((bricks.len(), COARSE));
             for (brick, mut row) in bricks.iter().zip(shapes.rows_mut()) {
                 let (mean, energy) = moments(&brick.values);
@@ -248,26 +259,33 @@ fn nearest(
             // The line through a shape leaves 1 - s² of a brick's energy: the most similar leaves the least.
             let similar = shapes.dot(&codebook);
             let each = ids.iter().zip(bricks).zip(similar.rows());
-            each.map(|((&id, brick), similar)| {
-                let mut closest = [(0.0f32, usize::MAX); CLOSEST];
-                for (j, &similar) in similar.iter().enumerate() {
-                    if similar > closest[CLOSEST - 1].0 && lender_ids[j] != id {
-                        let at = closest.partition_point(|(s, _)| *s >= similar);
-                        closest[at..].rotate_right(1);
-                        closest[at] = (similar, j);
-                    }
-                }
-                let offer = |&(_, j): &(f32, usize)| {
+            let offers = each.map(|((&id, brick), similar)| {
+                let offer = |j: usize| {
                     let (range, cost) = borrow(encodings, brick, lenders.get(j)?)?;
                     Some(Offer { lender: j as u32, range: range.to_word(), cost })
                 };
-                let mut offers: Vec<Offer> = closest.iter().filter_map(offer).collect();
+                let closest = closest(similar.iter().copied(), |j| self.lenders[j].0 != id);
+                let mut offers: Vec<Offer> = closest.into_iter().filter_map(offer).collect();
                 offers.sort_by(|a, b| a.cost.norm.total_cmp(&b.cost.norm));
                 offers
-            })
-            .collect::<Vec<_>>()
-        })
-        .collect()
+            });
+            offers.collect::<Vec<_>>()
+        };
+        self.borrowers.par_chunks(ROWS).zip(bricks.par_chunks(ROWS)).flat_map_iter(offers).collect()
+    }
+}
+
+/// The places of the greatest similarities above 0; places that are none stand for fewer.
+fn closest(similar: impl Iterator<Item = f32>, may_lend: impl Fn(usize) -> bool) -> [usize; CLOSEST] {
+    let mut closest = [(0.0f32, usize::MAX); CLOSEST];
+    for (j, similar) in similar.enumerate() {
+        if similar > closest[CLOSEST - 1].0 && may_lend(j) {
+            let at = closest.partition_point(|(s, _)| *s >= similar);
+            closest[at..].rotate_right(1);
+            closest[at] = (similar, j);
+        }
+    }
+    closest.map(|(_, j)| j)
 }
 
 /// The brick as a line through a lender's texels; `None` if it runs the other way.

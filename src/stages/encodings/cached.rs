@@ -214,25 +214,30 @@ impl Encodings {
                 .collect();
             for (&(batch, kind), entry) in wanted.iter().zip(entries) {
                 if let Some(entry) = entry {
-                    self.take(tree, batch, kind, &entry)?;
+                    self.take(tree, batch, kind, entry)?;
                 }
             }
         }
         Ok(())
     }
 
-    fn take(&mut self, tree: &SequenceTree, batch: usize, kind: Kind, entry: &Entry) -> io::Result<()> {
-        let (mut ids, mut found) = (Vec::new(), Entry::default());
-        for id in self.batches.all[batch].ids.clone() {
-            // The active voxels of these are those of other frames too.
-            if tree.pool.is_widened(id) {
-                continue;
-            }
+    fn take(&mut self, tree: &SequenceTree, batch: usize, kind: Kind, entry: Entry) -> io::Result<()> {
+        // The active voxels of widened bricks are those of other frames too.
+        let own = self.batches.all[batch].ids.clone().filter(|&id| !tree.pool.is_widened(id));
+        let (mut ids, mut places) = (Vec::new(), Vec::new());
+        for id in own {
             if let Some(i) = entry.find(tree.pool.home(id).brick) {
                 ids.push(id);
-                found.push_from(entry, i, kind.size());
+                places.push(i);
             }
         }
+        let found = if places.len() == entry.places.len() {
+            entry
+        } else {
+            let mut found = Entry::default();
+            places.into_iter().for_each(|i| found.push_from(&entry, i, kind.size()));
+            found
+        };
         let made = match kind {
             Kind::Plain => Made::Plain(found.plain),
             Kind::Texels(_) => {
