@@ -4,7 +4,7 @@ use std::fs::File;
 use std::io::{self, Read, Write};
 use std::path::Path;
 
-use super::store::{Entry, Map};
+use super::writer::Content;
 use super::{Blob, Cache, Key};
 
 /// Bytes that are copied and hashed at a time: enough for BLAKE3 to use its widest lanes.
@@ -13,18 +13,12 @@ const PIECE: usize = 1 << 20;
 impl Cache {
     /// Keeps a file, whose digest is known, as what a stage gave. A file that changes meanwhile is found out when it
     /// is read.
-    pub fn put_file(&self, key: &Key, path: &Path, blob: Blob) {
-        let copy = || -> io::Result<()> {
-            if !self.store.has_blob(&blob) {
-                let to = self.store.path(Map::Blobs, &blob.digest);
-                let mut from = File::open(path)?;
-                self.store.write_aside(&to, |file| io::copy(&mut from, file).map(drop))?;
-            }
-            self.store.write(Map::Actions, key.digest(), &Entry::new(key, blob).to_bytes())
-        };
-        if let Err(e) = copy() {
-            self.warn(format!("the cache {} cannot be written: {e}", self.folder().display()));
-        }
+    ///
+    /// # Errors
+    /// When the file cannot be opened.
+    pub fn put_file(&self, key: &Key, path: &Path, blob: Blob) -> io::Result<()> {
+        self.keep(key, blob, Content::File(File::open(path)?));
+        Ok(())
     }
 
     /// Copies what a stage gave into a file. Where this is false, something else may stand in it.

@@ -28,7 +28,7 @@ pub use maintain::{Damage, Stats};
 pub use stamps::Stamp;
 
 use store::{Entry, Map, Store};
-use writer::Writer;
+use writer::{Content, Writer};
 
 /// The store, and what is to be told of it.
 pub struct Cache {
@@ -95,8 +95,18 @@ impl Cache {
     pub fn put<T: Serialize>(&self, key: &Key, value: &T) {
         let bytes = artefact::encode(value);
         let blob = Blob { digest: blake3::hash(&bytes).into(), bytes: bytes.len() as u64 };
-        self.writer.write(Map::Blobs, blob.digest, bytes);
-        self.writer.write(Map::Actions, *key.digest(), Entry::new(key, blob).to_bytes());
+        self.keep(key, blob, Content::Bytes(bytes));
+    }
+
+    /// Lets a key stand for a result that is kept under another already.
+    pub fn put_alias(&self, key: &Key, blob: Blob) {
+        let entry = Entry::new(key, blob).to_bytes();
+        self.writer.write(Map::Actions, *key.digest(), Content::Bytes(entry));
+    }
+
+    fn keep(&self, key: &Key, blob: Blob, content: Content) {
+        self.writer.write(Map::Blobs, blob.digest, content);
+        self.put_alias(key, blob);
     }
 
     /// The digest and length of what a stage gave, without reading it.

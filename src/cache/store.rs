@@ -5,6 +5,7 @@ use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
+use super::writer::Content;
 use super::{Blob, Key};
 
 /// Which of the maps.
@@ -191,25 +192,23 @@ impl Store {
         Unusable { path, why: "its digest is not that of its bytes".to_owned() }
     }
 
-    /// Puts bytes in their place, in one step.
-    pub fn write(&self, map: Map, digest: &[u8; 32], bytes: &[u8]) -> io::Result<()> {
+    /// Puts an entry in its place, in one step.
+    pub fn write(&self, map: Map, digest: &[u8; 32], content: Content) -> io::Result<()> {
         let path = self.path(map, digest);
+        let bytes = match &content {
+            Content::Bytes(bytes) => bytes.len() as u64,
+            Content::File(file) => file.metadata()?.len(),
+        };
         // A blob is what its name says, or it is found out and removed when it is read.
-        if map == Map::Blobs && fs::metadata(&path).is_ok_and(|m| m.len() == bytes.len() as u64) {
+        if map == Map::Blobs && fs::metadata(&path).is_ok_and(|m| m.len() == bytes) {
             return Ok(());
         }
-        self.write_aside(&path, |file| file.write_all(bytes))
-    }
-
-    /// Writes a file beside its place, syncs and renames it.
-    pub fn write_aside(
-        &self,
-        path: &Path,
-        write: impl FnOnce(&mut File) -> io::Result<()>,
-    ) -> io::Result<()> {
         fs::create_dir_all(path.parent().unwrap_or(&self.root))?;
         let mut file = tempfile::NamedTempFile::new_in(self.root.join(ASIDE))?;
-        write(file.as_file_mut())?;
+        match content {
+            Content::Bytes(bytes) => file.write_all(&bytes)?,
+            Content::File(mut from) => io::copy(&mut from, file.as_file_mut()).map(drop)?,
+        }
         file.as_file().sync_all()?;
         // Others may share the store.
         crate::pack::make_readable(file.as_file())?;

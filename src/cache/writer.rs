@@ -1,5 +1,6 @@
 //! Writes entries while the build goes on: a sync takes as long as a disk likes.
 
+use std::fs::File;
 use std::io;
 use std::sync::mpsc::{SyncSender, sync_channel};
 use std::sync::{Arc, Mutex};
@@ -26,7 +27,14 @@ struct Running {
 struct Waiting {
     map: Map,
     digest: [u8; 32],
-    bytes: Vec<u8>,
+    content: Content,
+}
+
+/// What is to be written.
+pub(super) enum Content {
+    Bytes(Vec<u8>),
+    /// All of an open file, which may be renamed meanwhile.
+    File(File),
 }
 
 impl Writer {
@@ -35,10 +43,10 @@ impl Writer {
     }
 
     /// Takes an entry to be written.
-    pub fn write(&self, map: Map, digest: [u8; 32], bytes: Vec<u8>) {
+    pub fn write(&self, map: Map, digest: [u8; 32], content: Content) {
         let sender = lock(&self.thread).get_or_insert_with(|| Running::new(&self.store)).sender.clone();
         // A writer that gave up hears of nothing more.
-        let _ = sender.send(Waiting { map, digest, bytes });
+        let _ = sender.send(Waiting { map, digest, content });
     }
 
     /// Waits until all is written; the first failure, if any.
@@ -67,7 +75,7 @@ impl Running {
             let (store, receiver) = (store.clone(), Arc::clone(&receiver));
             let next = move || lock(&receiver).recv().ok();
             std::thread::spawn(move || {
-                std::iter::from_fn(next).try_for_each(|w| store.write(w.map, &w.digest, &w.bytes))
+                std::iter::from_fn(next).try_for_each(|w| store.write(w.map, &w.digest, w.content))
             })
         };
         Self { sender, threads: (0..THREADS).map(|_| thread()).collect() }

@@ -5,7 +5,7 @@ use crate::error::{Error, Result};
 use crate::settings::{Quality, Settings};
 use crate::stages::allocate::{self, AdaptiveGrid, AllocateError, Target};
 use crate::stages::encodings::{ConstantAim, Encodings, GridCache, Terms};
-use crate::stages::serialise::{GridInput, gpu_bytes, tree_bytes};
+use crate::stages::serialise::{GridInput, SerialiseError, gpu_bytes, tree_bytes};
 use crate::vdb::{GridClass, voxel_size};
 use crate::verify;
 
@@ -52,7 +52,7 @@ fn adaptive(
     let target = Target {
         quality: settings.quality,
         min_frame_psnr: settings.min_frame_psnr,
-        fixed_bytes: tree_bytes(grids).map_err(|e| Error::Unsupported(e.to_string()))?,
+        fixed_bytes: if is_size(settings.quality) { bytes(grids, tree_bytes)? } else { 0 },
     };
     let bricks: u64 = grids.iter().map(|g| u64::from(g.tree.pool.len())).sum();
     progress.stage("allocate", bricks, "bricks");
@@ -84,11 +84,23 @@ fn smallest_voxel(grid: &GridInput) -> f64 {
     grid.frames.iter().map(|f| voxel_size(&f.transform)).fold(f64::INFINITY, f64::min)
 }
 
+/// Whether it is bytes that are asked for, one way or another.
+fn is_size(quality: Quality) -> bool {
+    matches!(quality, Quality::Size(_) | Quality::BitsPerVoxel(_))
+}
+
+fn bytes(grids: &[GridInput], of: fn(&[GridInput]) -> Result<u64, SerialiseError>) -> Result<u64> {
+    of(grids).map_err(|e| Error::Unsupported(e.to_string()))
+}
+
 /// A size that the coarsest choice does not meet is an error that names the least.
 fn check_size(grids: &[GridInput], quality: Quality) -> Result<()> {
     let leaves: u64 = grids.iter().flat_map(|g| &g.tree.frames).map(|f| f.stats.leaves).sum();
     let bits_of = |bytes: u64| if leaves == 0 { 0.0 } else { bytes as f64 / (64.0 * leaves as f64) };
-    let bytes = gpu_bytes(grids).map_err(|e| Error::Unsupported(e.to_string()))?;
+    if !is_size(quality) {
+        return Ok(());
+    }
+    let bytes = bytes(grids, gpu_bytes)?;
     match quality {
         Quality::Size(asked) if bytes > asked => Err(Error::Usage(format!(
             "size: {asked} bytes on the GPU cannot be reached, the least is {bytes}: raise it, or pack fewer frames"

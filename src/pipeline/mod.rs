@@ -161,8 +161,8 @@ fn build_cached(
     }
     clock.lap("metadata");
 
-    let reuse = cache.map(|cache| Reuse::new(cache, &plan.provenance));
-    let reused = match &reuse {
+    let mut reuse = cache.map(|cache| Reuse::new(cache, &plan.provenance));
+    let reused = match &mut reuse {
         Some(reuse) => reuse.find(job, &plan.provenance)?,
         None => Reused::Nothing,
     };
@@ -172,7 +172,7 @@ fn build_cached(
         Reused::Nothing => (Made::Built, Some(run_stages(job, cache, alter, &plan, &mut clock, progress)?)),
     };
     let path = finished.as_ref().map_or(&*job.output, FinishedPack::path);
-    if let (Some(reuse), Made::Built | Made::Repacked) = (&reuse, made) {
+    if let (Some(reuse), Made::Built | Made::Repacked) = (&mut reuse, made) {
         reuse.keep(path)?;
     }
     clock.lap(if made == Made::Built { "encode and serialise" } else { "reuse" });

@@ -19,6 +19,8 @@ pub(super) struct Reuse<'a> {
     cache: &'a Cache,
     exact: Key,
     any_level: Key,
+    /// The pack, once it is known.
+    pack: Option<Blob>,
 }
 
 /// What it had.
@@ -36,13 +38,13 @@ impl<'a> Reuse<'a> {
         let mut any = provenance.clone();
         any.settings.zstd = 0;
         let key = |stage, provenance: &Provenance| Key::new(stage, &provenance.to_json().unwrap_or_default());
-        Self { cache, exact: key(&PACK, provenance), any_level: key(&ANY_LEVEL, &any) }
+        Self { cache, exact: key(&PACK, provenance), any_level: key(&ANY_LEVEL, &any), pack: None }
     }
 
     /// The pack, if it is there already, in the cache, or there at another level of zstd.
-    pub fn find(&self, job: &Job, provenance: &Provenance) -> Result<Reused> {
-        let exact = self.cache.blob(&self.exact);
-        let found = match exact {
+    pub fn find(&mut self, job: &Job, provenance: &Provenance) -> Result<Reused> {
+        self.pack = self.cache.blob(&self.exact);
+        let found = match self.pack {
             Some(blob) if self.is_at(&job.output, &blob, job.paranoid) => Reused::Unchanged,
             Some(blob) => self.copy(job, &blob)?.map_or(Reused::Nothing, |p| Reused::Pack(Made::Copied, p)),
             None => Reused::Nothing,
@@ -86,11 +88,12 @@ impl<'a> Reuse<'a> {
     }
 
     /// Keeps a pack that was made.
-    pub fn keep(&self, path: &Path) -> Result<()> {
+    pub fn keep(&mut self, path: &Path) -> Result<()> {
         let (digest, bytes) = digest(path)?;
         let blob = Blob { digest: digest.into(), bytes };
-        self.cache.put_file(&self.exact, path, blob);
-        self.cache.put_file(&self.any_level, path, blob);
+        self.pack = Some(blob);
+        self.cache.put_file(&self.exact, path, blob).map_err(Error::io(path))?;
+        self.cache.put_alias(&self.any_level, blob);
         Ok(())
     }
 
@@ -112,7 +115,6 @@ impl<'a> Reuse<'a> {
         if job.verify == VerifyLevel::None || job.pictures.images.is_some() {
             return None;
         }
-        let pack = self.cache.blob(&self.exact)?;
-        Some(Key::new(&VERIFY, &(pack.digest, job.verify, job.pictures.max_flip, job.pictures.device)))
+        Some(Key::new(&VERIFY, &(self.pack?.digest, job.verify, job.pictures.max_flip, job.pictures.device)))
     }
 }

@@ -26,7 +26,7 @@ pub struct Target {
     pub quality: Quality,
     /// The PSNR that no frame falls below; 6 dB below the whole's where none is given.
     pub min_frame_psnr: Option<f64>,
-    /// Bytes of tree and masks with a record for every brick.
+    /// Bytes of tree and masks with a record for every brick; only where a size is asked for.
     pub fixed_bytes: u64,
 }
 
