@@ -1,6 +1,6 @@
 //! The unique bricks of a sequence: small records in memory, values in a scratch file.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 use std::fs::File;
 use std::io::{self, BufWriter, Read, Seek, SeekFrom, Write};
 
@@ -30,8 +30,6 @@ pub struct Home {
 pub struct BrickPool {
     by_hash: HashMap<[u8; 32], u32>,
     bricks: Vec<Known>,
-    /// Bricks whose active voxels are those of several bricks of the source.
-    widened: HashSet<u32>,
     writer: BufWriter<File>,
     reader: File,
     /// Bricks in the scratch file.
@@ -58,7 +56,6 @@ impl BrickPool {
         Ok(Self {
             by_hash: HashMap::new(),
             bricks: Vec::new(),
-            widened: HashSet::new(),
             reader: file.try_clone()?,
             writer: BufWriter::with_capacity(1 << 20, file),
             written: 0,
@@ -101,13 +98,10 @@ impl BrickPool {
             self.bricks.push(Known { active: *active, keeps_mask, home, slot: None });
             return (id, true);
         }
+        // Without a kept mask bricks are one if their values are. The pool's counts as active what is
+        // active in any of them.
         let known = &mut self.bricks[id as usize];
-        if known.active != *active {
-            // Without a kept mask bricks are one if their values are. The pool's counts as active what is
-            // active in any of them.
-            known.active = known.active.union(active);
-            self.widened.insert(id);
-        }
+        known.active = known.active.union(active);
         (id, false)
     }
 
@@ -116,9 +110,9 @@ impl BrickPool {
         self.bricks[id as usize].home
     }
 
-    /// Whether a brick's active voxels are those of several bricks of the source.
-    pub fn is_widened(&self, id: u32) -> bool {
-        self.widened.contains(&id)
+    /// Which voxels of a brick are active, in any of the bricks of the source that it stands for.
+    pub fn active(&self, id: u32) -> &Mask512 {
+        &self.bricks[id as usize].active
     }
 
     /// Whether a brick's values were put in.

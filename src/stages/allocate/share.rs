@@ -21,7 +21,7 @@ use serde::{Deserialize, Serialize};
 use crate::cache::{Key, Stage};
 use crate::codec::{BrickRange, SequenceRange, decode};
 use crate::stages::dedup::SequenceTree;
-use crate::stages::encodings::{Batch, Cost, Encodings, KeptCodec};
+use crate::stages::encodings::{Batch, Cost, Encodings, KeptCodec, active};
 use crate::volume::{BRICK_VOXELS, Brick, Mask512};
 
 const STAGE: Stage = Stage { name: "share", version: 1 };
@@ -132,15 +132,11 @@ impl Comparison<'_> {
 
     /// What the offers depend on; `None` where nothing is cached.
     fn key(&self, encodings: &Encodings, tree: &SequenceTree) -> Option<Key> {
-        // The active voxels of these are those of frames that no key here stands for.
-        let is_widened = |id: u32| tree.pool.is_widened(id);
-        if self.borrowers.iter().any(|&id| is_widened(id)) || self.lenders.iter().any(|l| is_widened(l.0)) {
-            return None;
-        }
         let batches = &encodings.batches()[self.around.clone()];
         let keys: Option<Vec<[u8; 32]>> = batches.iter().map(|b| b.key.map(|key| *key.digest())).collect();
         let place = |id: u32| tree.pool.home(id).brick;
-        let borrowers: Vec<u32> = self.borrowers.iter().map(|&id| place(id)).collect();
+        let borrowers: Vec<(u32, u64)> =
+            self.borrowers.iter().map(|&id| (place(id), active(tree, id))).collect();
         // Places are told from each other by the batch that they are in.
         let counts: Vec<usize> =
             batches.iter().map(|batch| part(&self.lenders, |lender| lender.0, &batch.ids).len()).collect();

@@ -10,6 +10,7 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
+use xxhash_rust::xxh3::xxh3_64;
 
 use super::{Cost, Encodings, Kind, Made, Plain, Terms, Tried};
 use crate::cache::{Cache, Key, Stage};
@@ -59,6 +60,9 @@ pub(super) struct Batches {
 #[derive(Default, Serialize, Deserialize)]
 struct Entry {
     places: Vec<u32>,
+    /// Hashes of their active masks: a brick without a mask of its own stands for bricks of other frames too, and what
+    /// is active in any of them counts.
+    actives: Vec<u64>,
     plain: Vec<Plain>,
     costs: Vec<Cost>,
     #[serde(with = "serde_bytes")]
@@ -128,10 +132,9 @@ impl Batches {
     }
 
     /// Notes that bricks were made that the cache does not have.
-    pub fn mark(&mut self, tree: &SequenceTree, ids: &[u32], kind: Kind) {
+    pub fn mark(&mut self, ids: &[u32], kind: Kind) {
         if self.cache.is_some() {
-            let kept: Vec<u32> = ids.iter().copied().filter(|&id| !tree.pool.is_widened(id)).collect();
-            self.of(&kept).into_iter().for_each(|b| self.all[b].states[kind.index()].is_changed = true);
+            self.of(ids).into_iter().for_each(|b| self.all[b].states[kind.index()].is_changed = true);
         }
     }
 }
@@ -139,8 +142,8 @@ impl Batches {
 impl Entry {
     fn is_sound(&self, kind: Kind) -> bool {
         let count = self.places.len();
-        let lengths = [self.plain.len(), self.costs.len(), self.axes.len()];
-        let expected = if kind == Kind::Plain { [count, 0, 0] } else { [0, count, count] };
+        let lengths = [self.actives.len(), self.plain.len(), self.costs.len(), self.axes.len()];
+        let expected = if kind == Kind::Plain { [count, count, 0, 0] } else { [count, 0, count, count] };
         lengths == expected
             && self.bytes.len() == count * kind.size()
             && self.places.is_sorted_by(|a, b| a < b)
@@ -154,6 +157,7 @@ impl Entry {
 
     fn push_from(&mut self, other: &Self, i: usize, size: usize) {
         self.places.push(other.places[i]);
+        self.actives.push(other.actives[i]);
         self.plain.extend(other.plain.get(i));
         self.costs.extend(other.costs.get(i));
         self.axes.extend(other.axes.get(i));
@@ -222,11 +226,10 @@ impl Encodings {
     }
 
     fn take(&mut self, tree: &SequenceTree, batch: usize, kind: Kind, entry: Entry) -> io::Result<()> {
-        // The active voxels of widened bricks are those of other frames too.
-        let own = self.batches.all[batch].ids.clone().filter(|&id| !tree.pool.is_widened(id));
         let (mut ids, mut places) = (Vec::new(), Vec::new());
-        for id in own {
-            if let Some(i) = entry.find(tree.pool.home(id).brick) {
+        for id in self.batches.all[batch].ids.clone() {
+            let found = entry.find(tree.pool.home(id).brick);
+            if let Some(i) = found.filter(|&i| entry.actives[i] == active(tree, id)) {
                 ids.push(id);
                 places.push(i);
             }
@@ -260,8 +263,7 @@ impl Encodings {
                     continue;
                 }
                 let (ids, key) = (batch.ids.clone(), batch.key(kind).expect("what is cached has a key"));
-                let known: Vec<u32> =
-                    ids.filter(|&id| !tree.pool.is_widened(id) && self.is_known(id, kind)).collect();
+                let known: Vec<u32> = ids.filter(|&id| self.is_known(id, kind)).collect();
                 let entry = self.entry(tree, &known, kind)?;
                 // Another build may have asked for other bricks of the frame.
                 let others = cache.get::<Entry>(&key).filter(|entry| entry.is_sound(kind));
@@ -273,8 +275,11 @@ impl Encodings {
     }
 
     fn entry(&mut self, tree: &SequenceTree, ids: &[u32], kind: Kind) -> io::Result<Entry> {
-        let mut entry =
-            Entry { places: ids.iter().map(|&id| tree.pool.home(id).brick).collect(), ..Entry::default() };
+        let mut entry = Entry {
+            places: ids.iter().map(|&id| tree.pool.home(id).brick).collect(),
+            actives: ids.iter().map(|&id| active(tree, id)).collect(),
+            ..Entry::default()
+        };
         match kind {
             Kind::Plain => entry.plain = ids.iter().map(|&id| *self.plain(id)).collect(),
             Kind::Texels(codec) => {
@@ -287,4 +292,9 @@ impl Encodings {
         }
         Ok(entry)
     }
+}
+
+/// A hash of a brick's active voxels.
+pub fn active(tree: &SequenceTree, id: u32) -> u64 {
+    xxh3_64(bytemuck::bytes_of(tree.pool.active(id)))
 }

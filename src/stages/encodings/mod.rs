@@ -17,7 +17,7 @@ use crate::codec::{BATCH, BrickRange, Codec, SequenceRange, Texels, decode, enco
 use crate::settings::RangeMode;
 use crate::volume::{BRICK_VOXELS, BRICKS_IN_FLIGHT, Brick, InactiveRule, Mask512};
 use cached::Batches;
-pub use cached::{Batch, GridCache};
+pub use cached::{Batch, GridCache, active};
 use kept::KeptTexels;
 use measure::Measure;
 
@@ -122,6 +122,9 @@ pub struct Terms {
     pub sign_matters: Option<f64>,
 }
 
+/// Bricks of a batch at least: four fill the lanes of the BC7 encoder.
+const LEAST_BATCH: usize = 8;
+
 /// How long a build may go on before what it made is kept, so that one that is killed loses no more than that.
 const SAVE_EVERY: Duration = Duration::from_secs(2);
 
@@ -224,18 +227,20 @@ impl Encodings {
             bricks.clear();
             tree.read(&missing, &mut bricks)?;
             let shared: &SequenceTree = tree;
+            // A few bricks are shared out evenly.
+            let batch = missing.len().div_ceil(rayon::current_num_threads()).clamp(LEAST_BATCH, BATCH);
             let made: Vec<Vec<Made>> = missing
-                .par_chunks(BATCH)
-                .zip(bricks.par_chunks(BATCH))
+                .par_chunks(batch)
+                .zip(bricks.par_chunks(batch))
                 .map(|(ids, bricks)| self.make_batch(shared, ids, bricks, kinds))
                 .collect();
-            for (ids, made) in missing.chunks(BATCH).zip(made) {
+            for (ids, made) in missing.chunks(batch).zip(made) {
                 for (made, &kind) in made.into_iter().zip(kinds) {
                     self.keep(ids, kind, made)?;
                 }
             }
             for &kind in kinds {
-                self.batches.mark(tree, &missing, kind);
+                self.batches.mark(&missing, kind);
             }
             if self.saved.elapsed() > SAVE_EVERY {
                 self.save(tree)?;
