@@ -79,16 +79,21 @@ impl Cache {
 
     /// What a stage gave for some inputs, if it is known.
     pub fn get<T: DeserializeOwned>(&self, key: &Key) -> Option<T> {
-        let found = self.blob(key).and_then(|blob| {
+        let found = self.peek(key);
+        self.count(key, found.is_some());
+        found
+    }
+
+    /// The same for who asks not for its own sake: it counts as no use.
+    pub fn peek<T: DeserializeOwned>(&self, key: &Key) -> Option<T> {
+        self.blob(key).and_then(|blob| {
             let bytes = self.checked(self.store.read_blob(&blob))?;
             let value = artefact::decode(&bytes);
             if value.is_none() {
                 self.warn(format!("an entry of {} is of another version: it is made anew", key.stage()));
             }
             value
-        });
-        self.count(key, found.is_some());
-        found
+        })
     }
 
     /// Keeps what a stage gave. It may still be on its way to the disk when this returns: see [`Cache::flush`].

@@ -12,7 +12,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use xxhash_rust::xxh3::xxh3_64;
 
-use super::{Cost, Encodings, Kind, Made, Plain, Terms, Tried};
+use super::{Cost, Encodings, KeptCodec, Kind, Plain, Terms};
 use crate::cache::{Cache, Key, Stage};
 use crate::codec::{SequenceRange, encoder_isa};
 use crate::stages::dedup::SequenceTree;
@@ -89,17 +89,46 @@ impl Kind {
 
     const ALL: [Self; KINDS] = [
         Self::Plain,
-        Self::Texels(super::KeptCodec::Bc7),
-        Self::Texels(super::KeptCodec::Bc4),
-        Self::Texels(super::KeptCodec::Unorm8),
+        Self::Texels(KeptCodec::Bc7),
+        Self::Texels(KeptCodec::Bc4),
+        Self::Texels(KeptCodec::Unorm8),
     ];
 }
 
 impl Batch {
     fn key(&self, kind: Kind) -> Option<Key> {
         // The blocks of intel_tex_2 depend on what the machine can do.
-        let isa = (kind == Kind::Texels(super::KeptCodec::Bc7)).then(encoder_isa);
+        let isa = (kind == Kind::Texels(KeptCodec::Bc7)).then(encoder_isa);
         self.key.map(|key| Key::new(&STAGE, &(key.digest(), kind, isa)))
+    }
+}
+
+/// What the cache has of a batch.
+struct Found {
+    kind: Kind,
+    /// Bricks of the pool.
+    ids: Vec<u32>,
+    /// Those bricks, and no others.
+    entry: Entry,
+}
+
+impl Batch {
+    fn find(&self, tree: &SequenceTree, cache: &Cache, kind: Kind) -> Option<Found> {
+        let all = cache.get::<Entry>(&self.key(kind)?).filter(|entry| entry.is_sound(kind))?;
+        let (mut ids, mut places) = (Vec::new(), Vec::new());
+        for id in self.ids.clone() {
+            let found = all.places.binary_search(&tree.pool.home(id).brick).ok();
+            if let Some(i) = found.filter(|&i| all.actives[i] == active(tree, id)) {
+                ids.push(id);
+                places.push(i);
+            }
+        }
+        if places.len() == all.places.len() {
+            return Some(Found { kind, ids, entry: all });
+        }
+        let mut entry = Entry::default();
+        places.into_iter().for_each(|i| entry.push_from(&all, i, kind.size()));
+        Some(Found { kind, ids, entry })
     }
 }
 
@@ -148,11 +177,6 @@ impl Entry {
             && self.bytes.len() == count * kind.size()
             && self.places.is_sorted_by(|a, b| a < b)
             && self.axes.iter().all(|axis| *axis < 3)
-    }
-
-    /// The brick at a place of the frame.
-    fn find(&self, place: u32) -> Option<usize> {
-        self.places.binary_search(&place).ok()
     }
 
     fn push_from(&mut self, other: &Self, i: usize, size: usize) {
@@ -209,45 +233,22 @@ impl Encodings {
         }
         // Some at a time, since an entry is a megabyte.
         for wanted in wanted.chunks(64) {
-            let entries: Vec<Option<Entry>> = wanted
+            let batches = &self.batches.all;
+            let found: Vec<Found> = wanted
                 .par_iter()
-                .map(|&(batch, kind)| {
-                    let key = self.batches.all[batch].key(kind)?;
-                    cache.get::<Entry>(&key).filter(|entry| entry.is_sound(kind))
-                })
+                .filter_map(|&(batch, kind)| batches[batch].find(tree, &cache, kind))
                 .collect();
-            for (&(batch, kind), entry) in wanted.iter().zip(entries) {
-                if let Some(entry) = entry {
-                    self.take(tree, batch, kind, entry)?;
-                }
+            let of = |kind: Kind| found.iter().filter(move |found| found.kind == kind);
+            self.kept.par_iter_mut().zip(KeptCodec::ALL).try_for_each(|(kept, codec)| {
+                of(Kind::Texels(codec)).try_for_each(|Found { ids, entry, .. }| {
+                    kept.add(ids, &entry.costs, &entry.bytes, &entry.axes)
+                })
+            })?;
+            for Found { ids, entry, .. } in of(Kind::Plain) {
+                self.keep_plain(ids, &entry.plain);
             }
         }
         Ok(())
-    }
-
-    fn take(&mut self, tree: &SequenceTree, batch: usize, kind: Kind, entry: Entry) -> io::Result<()> {
-        let (mut ids, mut places) = (Vec::new(), Vec::new());
-        for id in self.batches.all[batch].ids.clone() {
-            let found = entry.find(tree.pool.home(id).brick);
-            if let Some(i) = found.filter(|&i| entry.actives[i] == active(tree, id)) {
-                ids.push(id);
-                places.push(i);
-            }
-        }
-        let found = if places.len() == entry.places.len() {
-            entry
-        } else {
-            let mut found = Entry::default();
-            places.into_iter().for_each(|i| found.push_from(&entry, i, kind.size()));
-            found
-        };
-        let made = match kind {
-            Kind::Plain => Made::Plain(found.plain),
-            Kind::Texels(_) => {
-                Made::Texels(Tried { costs: found.costs, bytes: found.bytes, axes: found.axes })
-            }
-        };
-        self.keep(&ids, kind, made)
     }
 
     /// Keeps what was made and the cache does not have yet.
@@ -266,7 +267,7 @@ impl Encodings {
                 let known: Vec<u32> = ids.filter(|&id| self.is_known(id, kind)).collect();
                 let entry = self.entry(tree, &known, kind)?;
                 // Another build may have asked for other bricks of the frame.
-                let others = cache.get::<Entry>(&key).filter(|entry| entry.is_sound(kind));
+                let others = cache.peek::<Entry>(&key).filter(|entry| entry.is_sound(kind));
                 cache.put(&key, &entry.union(&others.unwrap_or_default(), kind));
             }
         }

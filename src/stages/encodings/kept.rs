@@ -3,7 +3,7 @@
 use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom, Write};
 
-use super::{Cost, Tried};
+use super::Cost;
 use crate::codec::Codec;
 
 /// Bytes between two bricks that are read through rather than skipped: a call to the system costs about as much.
@@ -29,19 +29,19 @@ impl KeptTexels {
     }
 
     /// Keeps what was made of some bricks.
-    pub fn add(&mut self, ids: &[u32], tried: &Tried) -> io::Result<()> {
+    pub fn add(&mut self, ids: &[u32], costs: &[Cost], bytes: &[u8], axes: &[u8]) -> io::Result<()> {
         let file = match &mut self.file {
             Some(file) => file,
             none => none.insert(tempfile::tempfile()?),
         };
         file.seek(SeekFrom::End(0))?;
-        file.write_all(&tried.bytes)?;
+        file.write_all(bytes)?;
         let last = ids.iter().max().map_or(0, |id| *id as usize + 1);
         self.known.resize(self.known.len().max(last), None);
-        for ((&id, &cost), place) in ids.iter().zip(&tried.costs).zip(self.axes.len() as u32..) {
+        for ((&id, &cost), place) in ids.iter().zip(costs).zip(self.axes.len() as u32..) {
             self.known[id as usize] = Some((place, cost));
         }
-        self.axes.extend(&tried.axes);
+        self.axes.extend(axes);
         Ok(())
     }
 

@@ -228,7 +228,9 @@ impl Encodings {
             tree.read(&missing, &mut bricks)?;
             let shared: &SequenceTree = tree;
             // A few bricks are shared out evenly.
-            let batch = missing.len().div_ceil(rayon::current_num_threads()).clamp(LEAST_BATCH, BATCH);
+            let threads = rayon::current_num_threads();
+            let batches = missing.len().div_ceil(BATCH).next_multiple_of(threads).max(threads);
+            let batch = missing.len().div_ceil(batches).max(LEAST_BATCH);
             let made: Vec<Vec<Made>> = missing
                 .par_chunks(batch)
                 .zip(bricks.par_chunks(batch))
@@ -294,14 +296,20 @@ impl Encodings {
 
     fn keep(&mut self, ids: &[u32], kind: Kind, made: Made) -> io::Result<()> {
         match (kind, made) {
-            (Kind::Texels(codec), Made::Texels(tried)) => self.kept[codec as usize].add(ids, &tried),
+            (Kind::Texels(codec), Made::Texels(Tried { costs, bytes, axes })) => {
+                self.kept[codec as usize].add(ids, &costs, &bytes, &axes)
+            }
             (_, Made::Plain(plain)) => {
-                self.plain.resize(self.rules.len(), Plain::UNKNOWN);
-                ids.iter().zip(plain).for_each(|(&id, plain)| self.plain[id as usize] = plain);
+                self.keep_plain(ids, &plain);
                 Ok(())
             }
             (Kind::Plain, Made::Texels(_)) => unreachable!("plain bricks have no texels"),
         }
+    }
+
+    fn keep_plain(&mut self, ids: &[u32], plain: &[Plain]) {
+        self.plain.resize(self.rules.len(), Plain::UNKNOWN);
+        ids.iter().zip(plain).for_each(|(&id, plain)| self.plain[id as usize] = *plain);
     }
 }
 
