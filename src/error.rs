@@ -61,6 +61,9 @@ pub enum Error {
     /// A device that failed, or another thing that should not happen.
     #[error("{0}")]
     Other(String),
+    /// The user ended it.
+    #[error("interrupted: outputs are as they were, and what was done so far is kept for the next build")]
+    Interrupted,
     /// A pack that does not say what its source says.
     #[error("{0}")]
     Verify(String),
@@ -109,6 +112,8 @@ impl Error {
             Self::OutOfRange { .. } => 3,
             Self::Verify(_) => 4,
             Self::Unsupported(_) => 6,
+            // What shells say of a process that Ctrl-C ended.
+            Self::Interrupted => 130,
         }
     }
 }

@@ -18,7 +18,7 @@
 //! - [`verify`] compares a finished pack with its source, [`report`] puts files into figures.
 //! - [`render`] traces pictures of packs and sources, on the CPU and through wgpu.
 //! - [`sweep`] measures many settings side by side, and how steady each is.
-//! - [`cli`] is the command line.
+//! - [`cli`] is the command line; [`interrupt`] ends long work in good order.
 //!
 //! To build a pack:
 //!
@@ -37,6 +37,7 @@ pub mod cache;
 pub mod cli;
 pub mod codec;
 pub mod error;
+pub mod interrupt;
 pub mod manifest;
 pub mod pack;
 pub mod pipeline;

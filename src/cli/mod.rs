@@ -2,13 +2,16 @@
 
 mod build;
 mod cache;
+mod explain;
 mod init;
 mod inspect;
+mod jobs;
 mod progress;
 mod render;
 mod style;
 mod sweep;
 mod verify;
+mod watch;
 
 use std::path::PathBuf;
 
@@ -60,6 +63,10 @@ struct Common {
 enum Command {
     /// Build packs from a manifest, or one pack from files
     Build(Box<build::BuildArgs>),
+    /// Build what changed whenever frames land
+    Watch(Box<watch::WatchArgs>),
+    /// Say which stages a build would run, and why
+    Explain(explain::ExplainArgs),
     /// Look after what builds keep
     Cache(cache::Arguments),
     /// Find the sequences in a folder and write a manifest for them
@@ -145,9 +152,9 @@ impl SettingsArgs {
 /// How much a pack is checked, as the command line has it.
 #[derive(Args)]
 struct VerifyArg {
-    /// How much of the finished pack is checked
-    #[arg(long, value_name = "LEVEL", default_value = "all")]
-    verify: VerifyLevel,
+    /// How much of the finished pack is checked [default: all, for watch: voxels]
+    #[arg(long, value_name = "LEVEL")]
+    verify: Option<VerifyLevel>,
     #[command(flatten)]
     pictures: PictureArgs,
 }
@@ -189,6 +196,8 @@ pub fn run(cli: Cli) -> Result<()> {
     }
     match cli.command {
         Command::Build(args) => build::run(&args, cli.common),
+        Command::Watch(args) => watch::run(&args, cli.common),
+        Command::Explain(args) => explain::run(&args),
         Command::Cache(args) => cache::run(&args, cli.common),
         Command::Init(args) => init::run(&args, cli.common),
         Command::Inspect(args) => inspect::run(&args),

@@ -3,6 +3,7 @@
 use std::fs::File;
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use tempfile::NamedTempFile;
 
@@ -203,7 +204,26 @@ fn beside(path: &Path) -> io::Result<NamedTempFile> {
         _ => Path::new("."),
     };
     std::fs::create_dir_all(folder)?;
-    tempfile::Builder::new().prefix(".volpack-").tempfile_in(folder)
+    remove_left_behind(folder);
+    tempfile::Builder::new().prefix(PREFIX).tempfile_in(folder)
+}
+
+/// What the names of unfinished packs begin with.
+const PREFIX: &str = ".volpack-";
+/// A pack that was being written this long ago was left by a process that was killed.
+const LEFT_BEHIND: Duration = Duration::from_secs(24 * 3600);
+
+fn remove_left_behind(folder: &Path) {
+    let is_old = |entry: &std::fs::DirEntry| {
+        let modified = entry.metadata().and_then(|m| m.modified()).ok();
+        modified.and_then(|m| m.elapsed().ok()).is_some_and(|age| age > LEFT_BEHIND)
+    };
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
+    let ours = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(PREFIX));
+    for entry in ours.filter(is_old) {
+        // Tidying up must not keep anyone from building.
+        let _ = std::fs::remove_file(entry.path());
+    }
 }
 
 /// A pack that is whole and lies beside its final place. It is gone if it is dropped.

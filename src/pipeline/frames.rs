@@ -42,6 +42,7 @@ pub(super) fn read(
         grids.push(grid_input(sequence, grid, tree, settings));
     }
     for window in sequence.frames.chunks(rayon::current_num_threads()) {
+        crate::interrupt::check().map_err(scratch)?;
         let read = |frame: &FrameSource| read_frame(frame, selection, settings, cache.map(|c| &**c), alter);
         let frames: Vec<_> = window.par_iter().map(read).collect();
         for (source, frame) in window.iter().zip(frames) {
@@ -144,6 +145,20 @@ pub(super) fn caches(
         cache.map(|cache| GridCache { cache: Arc::clone(cache), frames: keys.collect() })
     };
     selection.grids.iter().map(of_grid).collect()
+}
+
+/// The names of files of which something is selected that the cache does not have.
+pub(super) fn unknown(
+    sequence: &SequenceInfo,
+    selection: &Selection,
+    settings: &Settings,
+    cache: Option<&Cache>,
+) -> Vec<String> {
+    let is_known = |frame: &FrameSource, grid: &SelectedGrid| {
+        key(frame, grid, settings).is_none_or(|key| cache.is_some_and(|cache| cache.has(&key)))
+    };
+    let unknown = |frame: &&FrameSource| !selection.grids.iter().all(|grid| is_known(frame, grid));
+    sequence.frames.iter().filter(unknown).map(FrameSource::file_name).collect()
 }
 
 fn mask_policy(settings: &Settings, class: GridClass) -> MaskPolicy {

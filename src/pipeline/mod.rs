@@ -1,6 +1,7 @@
 //! Strings the stages together.
 
 mod allocation;
+mod explain;
 mod frames;
 mod reuse;
 
@@ -21,6 +22,7 @@ use crate::stages::quantise::QuantiseError;
 use crate::stages::select::{Selection, select};
 use crate::stages::serialise::{GridInput, SerialiseError, serialise};
 use crate::verify::{self, PictureSettings, Sources, VerifyReport};
+pub use explain::{Explanation, StagePlan, explain};
 use frames::Alter;
 use reuse::{Reuse, Reused};
 
@@ -200,7 +202,7 @@ fn build_cached(
 }
 
 /// What a job comes to, as far as it can be told without a voxel.
-pub(crate) struct Plan {
+struct Plan {
     sequence: SequenceInfo,
     selection: Selection,
     provenance: Provenance,

@@ -57,6 +57,18 @@ impl<'a> Reuse<'a> {
         Ok(found)
     }
 
+    /// Whether the cache has the pack, or it at another level of zstd, and whether the output is the pack.
+    pub fn look(&mut self, job: &Job) -> (bool, bool, bool) {
+        self.pack = self.cache.blob(&self.exact);
+        let is_there = self.pack.is_some_and(|blob| self.is_at(&job.output, &blob, job.paranoid));
+        (self.cache.has(&self.exact), self.cache.has(&self.any_level), is_there)
+    }
+
+    /// Whether the cache has the verification as the job asks for it.
+    pub fn is_verified(&self, job: &Job) -> bool {
+        self.verify_key(job).is_some_and(|key| self.cache.has(&key))
+    }
+
     /// Whether a file has a blob's bytes.
     fn is_at(&self, path: &Path, blob: &Blob, paranoid: bool) -> bool {
         let Ok(stamp) = Stamp::of(path) else { return false };

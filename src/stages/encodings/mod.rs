@@ -14,6 +14,7 @@ use serde::{Deserialize, Serialize};
 
 use super::dedup::{SequenceTree, carried};
 use crate::codec::{BATCH, BrickRange, Codec, SequenceRange, Texels, decode, encode, spread};
+use crate::interrupt;
 use crate::settings::RangeMode;
 use crate::volume::{BRICK_VOXELS, BRICKS_IN_FLIGHT, Brick, InactiveRule, Mask512};
 use cached::Batches;
@@ -222,6 +223,10 @@ impl Encodings {
         self.load(tree, ids, kinds)?;
         let mut bricks = Vec::new();
         for window in ids.chunks(BRICKS_IN_FLIGHT as usize) {
+            if interrupt::is_requested() {
+                self.save(tree)?;
+                interrupt::check()?;
+            }
             let missing: Vec<u32> =
                 window.iter().copied().filter(|&id| kinds.iter().any(|k| !self.is_known(id, *k))).collect();
             bricks.clear();

@@ -1,0 +1,112 @@
+//! What there is to build, as the command line or a manifest says it.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use clap::Args;
+
+use super::cache::CacheChoice;
+use super::{SettingsArgs, VerifyArg};
+use crate::cache::Cache;
+use crate::error::{Error, Result};
+use crate::manifest::{Asset, DEFAULT_NAME, Manifest, expand};
+use crate::pipeline::{Job, VerifyLevel};
+
+#[derive(Args)]
+pub struct JobArgs {
+    /// The files of one sequence, in place of a manifest
+    #[arg(value_name = "FILES", conflicts_with_all = ["manifest", "assets"])]
+    pub frames: Vec<PathBuf>,
+    /// The pack to write, with FILES
+    #[arg(short, long, value_name = "OUT.volpack", requires = "frames")]
+    output: Option<PathBuf>,
+    /// The manifest
+    #[arg(short, long, value_name = "FILE", default_value = DEFAULT_NAME)]
+    manifest: PathBuf,
+    /// Build only this asset of the manifest; may be given more than once
+    #[arg(long = "asset", value_name = "NAME")]
+    assets: Vec<String>,
+    #[command(flatten)]
+    settings: SettingsArgs,
+    #[command(flatten)]
+    verify: VerifyArg,
+    /// Make warnings errors: a missing frame, a grid that some frames lack
+    #[arg(long)]
+    strict: bool,
+    #[command(flatten)]
+    pub cache: CacheChoice,
+}
+
+impl JobArgs {
+    /// The packs that are asked for, with the names to show, checked as `verify` says where nothing is said.
+    /// One whose files cannot be found is an error of its own.
+    pub fn jobs(
+        &self,
+        cache: Option<&Arc<Cache>>,
+        verify: VerifyLevel,
+    ) -> Result<Vec<(String, Result<Job>)>> {
+        let job = |frames, output: &Path, settings, max_flip| Job {
+            frames,
+            output: output.to_owned(),
+            settings,
+            strict: self.strict,
+            verify: self.verify.verify.unwrap_or(verify),
+            pictures: self.verify.pictures.settings(max_flip),
+            cache: cache.cloned(),
+            paranoid: self.cache.paranoid,
+        };
+        if !self.frames.is_empty() {
+            let output = self
+                .output
+                .as_deref()
+                .ok_or_else(|| Error::Usage("FILES need a pack to go into: add -o OUT.volpack".to_owned()))?;
+            let name = output.file_stem().map_or_else(|| "pack".into(), |s| s.to_string_lossy().into_owned());
+            let settings = self.settings.settings()?;
+            return Ok(vec![(name, expand(&self.frames).map(|f| job(f, output, settings, None)))]);
+        }
+        if self.output.is_some() || self.settings.any() {
+            return Err(Error::Usage(
+                "-o and the settings of a pack go with FILES; for a manifest they stand in it".to_owned(),
+            ));
+        }
+        let assets = assets(&self.manifest, &self.assets)?;
+        let of_asset = |(name, asset): (String, Asset)| {
+            let frames = expand(&asset.frames);
+            (name, frames.map(|frames| job(frames, &asset.output, asset.settings, asset.max_flip)))
+        };
+        Ok(assets.into_iter().map(of_asset).collect())
+    }
+}
+
+/// Some assets of a manifest, or all of them where none are named.
+pub fn assets(path: &Path, names: &[String]) -> Result<Vec<(String, Asset)>> {
+    if !path.exists() {
+        return Err(Error::Usage(format!(
+            "there is no manifest {}: name one with -m, or give files: volpack build FILES... -o OUT.volpack",
+            path.display()
+        )));
+    }
+    let manifest = Manifest::read(path)?;
+    let names: Vec<&String> =
+        if names.is_empty() { manifest.assets.keys().collect() } else { names.iter().collect() };
+    if names.is_empty() {
+        return Err(Error::Manifest {
+            path: path.to_owned(),
+            message: "there is nothing to build: add an [asset.NAME] with its frames".to_owned(),
+        });
+    }
+    let mut assets: Vec<(String, Asset)> = Vec::new();
+    let mut outputs = HashMap::new();
+    for name in names {
+        let asset = manifest.asset(name)?;
+        if let Some(other) = outputs.insert(&asset.output, name) {
+            return Err(Error::Usage(format!(
+                "assets {other:?} and {name:?} would both be {}",
+                asset.output.display()
+            )));
+        }
+        assets.push((name.clone(), asset.clone()));
+    }
+    Ok(assets)
+}

@@ -1,0 +1,179 @@
+//! `volpack watch`.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::time::{Duration, Instant, SystemTime};
+
+use clap::Args;
+
+use super::jobs::JobArgs;
+use super::style::{ERROR, GOOD, TITLE, WARNING, bytes, psnr, seconds};
+use super::{Common, outln};
+use crate::cache::Stamp;
+use crate::error::{Error, Result};
+use crate::interrupt;
+use crate::pipeline::{Job, Made, Outcome, Progress, VerifyLevel, build};
+use crate::settings::Settings;
+
+/// How often files are looked at. Asking beats being told: network drives, where farms render to, tell nothing.
+const LOOK_EVERY: Duration = Duration::from_millis(200);
+
+/// A frame that cannot be read is still being written while its last change is no longer ago than this.
+const STILL_WRITTEN: Duration = Duration::from_secs(10);
+
+#[derive(Args)]
+pub struct WatchArgs {
+    #[command(flatten)]
+    jobs: JobArgs,
+    /// How long files must stay as they are before they are built, in seconds
+    #[arg(long, value_name = "SECONDS", default_value = "1", value_parser = super::above_zero)]
+    settle: f64,
+}
+
+/// What an asset is made from, as it was last seen.
+#[derive(PartialEq)]
+struct Seen {
+    files: Vec<(PathBuf, Option<Stamp>)>,
+    settings: Option<Settings>,
+    trouble: Option<String>,
+}
+
+struct Asset {
+    seen: Seen,
+    since: Instant,
+    /// Whether it was built, or found wanting, since it changed.
+    is_done: bool,
+}
+
+/// Keeps warnings for the one line.
+#[derive(Default)]
+struct Quiet(Vec<String>);
+
+impl Progress for Quiet {
+    fn stage(&mut self, _: &'static str, _: u64, _: &'static str) {}
+    fn advance(&mut self, _: u64) {}
+    fn warn(&mut self, warning: &str) {
+        self.0.push(warning.to_owned());
+    }
+}
+
+pub fn run(args: &WatchArgs, common: Common) -> Result<()> {
+    let cache = args.jobs.cache.open();
+    let settle = Duration::from_secs_f64(args.settle);
+    let mut assets: BTreeMap<String, Asset> = BTreeMap::new();
+    let mut trouble = None;
+    // A manifest that is wrong to begin with is an error, one that is being edited is waited for.
+    args.jobs.jobs(cache.as_ref(), VerifyLevel::Voxels)?;
+    while !interrupt::is_requested() {
+        match args.jobs.jobs(cache.as_ref(), VerifyLevel::Voxels) {
+            Ok(jobs) => {
+                trouble = None;
+                for (name, job) in jobs {
+                    look(&mut assets, &name, job, settle, common);
+                }
+            }
+            Err(error) => tell_once(&mut trouble, &error),
+        }
+        std::thread::sleep(LOOK_EVERY);
+    }
+    Ok(())
+}
+
+fn tell_once(told: &mut Option<String>, error: &Error) {
+    let text = error.to_string();
+    if told.as_ref() != Some(&text) {
+        anstream::eprintln!("{ERROR}error{ERROR:#}: {text}");
+        *told = Some(text);
+    }
+}
+
+/// Looks at one asset, and builds it if it changed and has settled.
+fn look(
+    assets: &mut BTreeMap<String, Asset>,
+    name: &str,
+    job: Result<Job>,
+    settle: Duration,
+    common: Common,
+) {
+    let seen = match &job {
+        Ok(job) => Seen {
+            files: job.frames.iter().map(|file| (file.clone(), Stamp::of(file).ok())).collect(),
+            settings: Some(job.settings.clone()),
+            trouble: None,
+        },
+        Err(error) => Seen { files: Vec::new(), settings: None, trouble: Some(error.to_string()) },
+    };
+    let now = Instant::now();
+    let asset = match assets.get_mut(name) {
+        Some(asset) if asset.seen == seen => asset,
+        _ => {
+            assets.insert(name.to_owned(), Asset { seen, since: now, is_done: false });
+            return;
+        }
+    };
+    if asset.is_done || now.duration_since(asset.since) < settle {
+        return;
+    }
+    match job {
+        Err(error) => {
+            outln!("{TITLE}{name}{TITLE:#}: waiting: {error}");
+            asset.is_done = true;
+        }
+        Ok(job) => asset.is_done = build_one(name, &job, common),
+    }
+}
+
+/// Builds and prints the one line. Whether that is all until something changes.
+fn build_one(name: &str, job: &Job, common: Common) -> bool {
+    let start = Instant::now();
+    let mut progress = Quiet::default();
+    let outcome = build(job, &mut progress);
+    let warnings = progress.0.iter().map(|w| format!("; {WARNING}{w}{WARNING:#}")).collect::<String>();
+    match outcome {
+        Err(Error::Interrupted) => {}
+        Err(Error::Vdb { path, .. }) if is_being_written(&path) => return false,
+        Err(error) => {
+            outln!("{TITLE}{name}{TITLE:#}: {ERROR}kept the last good pack{ERROR:#}: {error}");
+        }
+        Ok(outcome) => {
+            if let Some(report) = outcome.verification.as_ref().filter(|report| !report.ok) {
+                let why = report.failures.first().map_or("", String::as_str);
+                outln!(
+                    "{TITLE}{name}{TITLE:#}: {ERROR}kept the last good pack{ERROR:#}: not verified: {why}"
+                );
+            } else if !common.quiet {
+                let line = summary(&outcome);
+                outln!(
+                    "{TITLE}{name}{TITLE:#}: {line}, in {}{warnings}",
+                    seconds(start.elapsed().as_secs_f64())
+                );
+            }
+        }
+    }
+    true
+}
+
+fn is_being_written(path: &std::path::Path) -> bool {
+    let changed = std::fs::metadata(path).and_then(|m| m.modified());
+    let age = changed.ok().and_then(|changed| SystemTime::now().duration_since(changed).ok());
+    age.is_some_and(|age| age < STILL_WRITTEN)
+}
+
+fn summary(outcome: &Outcome) -> String {
+    let pack = &outcome.summary;
+    let frames = if pack.frames == 1 { "frame" } else { "frames" };
+    let quality =
+        outcome.verification.as_ref().map_or(String::new(), |r| format!(", {}", psnr(r.active.psnr)));
+    let how = match outcome.made {
+        Made::Unchanged => format!("{GOOD}up to date{GOOD:#}"),
+        Made::Copied => format!("{GOOD}taken from the cache{GOOD:#}"),
+        Made::Repacked => format!("{GOOD}packed anew{GOOD:#}"),
+        Made::Built => match outcome.cache.get("outline") {
+            Some(uses) => {
+                format!("{GOOD}built{GOOD:#}, {} of {} read anew", uses.misses, uses.hits + uses.misses)
+            }
+            None => format!("{GOOD}built{GOOD:#}"),
+        },
+    };
+    format!("{how}: {} {frames}, {}{quality}", pack.frames, bytes(pack.file_bytes))
+}

@@ -1,0 +1,130 @@
+//! What a build would do, and why.
+
+use serde::Serialize;
+use serde_json::Value as Json;
+
+use super::reuse::Reuse;
+use super::{Job, Plan, Silent, frames, plan};
+use crate::error::Result;
+use crate::pack::{Pack, Provenance};
+
+/// What a build would do.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Explanation {
+    /// What is not as it was when the output was made.
+    pub reasons: Vec<String>,
+    /// The stages that would run; none where the output is what a build would make.
+    pub stages: Vec<StagePlan>,
+}
+
+/// A stage that would run.
+#[derive(Clone, Debug, Serialize)]
+pub struct StagePlan {
+    /// Its name.
+    pub stage: &'static str,
+    /// What it would work on.
+    pub work: String,
+}
+
+/// Says what [`super::build`] would do, without a voxel being read.
+///
+/// # Errors
+/// As [`super::build`] for sources that cannot be read or selected.
+pub fn explain(job: &Job) -> Result<Explanation> {
+    let (plan, _) = plan(job, &mut Silent)?;
+    let mut out = Explanation { reasons: reasons(job, &plan.provenance), stages: Vec::new() };
+    let mut say = |stage, work: String| out.stages.push(StagePlan { stage, work });
+    let mut reuse = job.cache.as_deref().map(|cache| Reuse::new(cache, &plan.provenance));
+    let (has_pack, has_other_level, is_there) = match &mut reuse {
+        Some(reuse) => reuse.look(job),
+        None => (false, false, false),
+    };
+    if is_there && reuse.as_ref().is_some_and(|reuse| reuse.is_verified(job)) {
+        return Ok(out);
+    }
+    if !has_pack && !has_other_level {
+        stages(job, &plan, &mut say);
+    }
+    match (is_there, has_pack, has_other_level) {
+        (true, ..) => {}
+        (_, true, _) => say("serialise", "copied from the cache".to_owned()),
+        (.., true) => say("serialise", format!("packed anew at zstd {}, from the cache", job.settings.zstd)),
+        _ => say("serialise", "all".to_owned()),
+    }
+    if !reuse.is_some_and(|reuse| reuse.is_verified(job)) {
+        say("verify", "voxels and pictures".to_owned());
+    }
+    Ok(out)
+}
+
+/// Stages 3 to 7.
+fn stages(job: &Job, plan: &Plan, say: &mut impl FnMut(&'static str, String)) {
+    let all = plan.sequence.frames.len();
+    let unknown = frames::unknown(&plan.sequence, &plan.selection, &job.settings, job.cache.as_deref());
+    let listed = match &unknown[..] {
+        [] => String::new(),
+        few if few.len() <= LISTED => format!(": {}", few.join(", ")),
+        many => format!(": {} and {} more", many[..LISTED].join(", "), many.len() - LISTED),
+    };
+    if !unknown.is_empty() {
+        say("flatten", format!("{} of {all} frames{listed}", unknown.len()));
+    }
+    say("dedup", format!("{all} frames"));
+    say("allocate", "all bricks, from what the cache knows of them".to_owned());
+    if unknown.len() == all {
+        say("quantise", "all bricks".to_owned());
+    } else {
+        say("quantise", "bricks of those frames, and what else is asked for and not in the cache".to_owned());
+    }
+}
+
+/// Frames that are named; more are counted.
+const LISTED: usize = 5;
+
+/// What differs between the output, if it is there, and what would be made.
+fn reasons(job: &Job, new: &Provenance) -> Vec<String> {
+    let old = match Pack::open(&job.output) {
+        Ok(pack) => pack.provenance,
+        Err(_) if !job.output.exists() => return vec![format!("there is no {}", job.output.display())],
+        Err(e) => return vec![format!("{} cannot be used: {e}", job.output.display())],
+    };
+    let mut reasons = Vec::new();
+    if old.version != new.version {
+        reasons.push(format!("volpack {} made it, this is {}", old.version, new.version));
+    }
+    if old.encoder_isa.is_some() && new.encoder_isa.is_some() && old.encoder_isa != new.encoder_isa {
+        reasons.push("its blocks were made for another instruction set".to_owned());
+    }
+    let settings = |provenance: &Provenance| {
+        let mut settings = serde_json::to_value(&provenance.settings).unwrap_or_default();
+        settings["quality"] = provenance.settings.quality.to_string().into();
+        settings
+    };
+    let text = |value: &Json| value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+    if let (Json::Object(old), Json::Object(new)) = (settings(&old), settings(new)) {
+        for (key, new) in &new {
+            let old = old.get(key).unwrap_or(&Json::Null);
+            if old != new {
+                reasons.push(format!("{key} was {} and is {}", text(old), text(new)));
+            }
+        }
+    }
+    let changed = |old: &Provenance, new: &Provenance, what: &str| {
+        let missing = |s: &&crate::pack::Source| !old.sources.iter().any(|o| o.file == s.file);
+        let files: Vec<&str> = new.sources.iter().filter(missing).map(|s| s.file.as_str()).collect();
+        (!files.is_empty()).then(|| named(&files, what))
+    };
+    let differs =
+        |s: &&crate::pack::Source| old.sources.iter().any(|o| o.file == s.file && o.blake3 != s.blake3);
+    let files: Vec<&str> = new.sources.iter().filter(differs).map(|s| s.file.as_str()).collect();
+    reasons.extend((!files.is_empty()).then(|| named(&files, "changed")));
+    reasons.extend(changed(&old, new, "came"));
+    reasons.extend(changed(new, &old, "went"));
+    reasons
+}
+
+fn named(files: &[&str], what: &str) -> String {
+    let rest = files.len().saturating_sub(LISTED);
+    let more = if rest > 0 { format!(" and {rest} more") } else { String::new() };
+    format!("{}{more} {what}", files[..files.len() - rest].join(", "))
+}
