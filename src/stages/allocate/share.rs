@@ -54,6 +54,9 @@ struct Offer {
     cost: Cost,
 }
 
+/// For each borrower of a batch, the closest first.
+type Offers = Vec<Vec<Offer>>;
+
 /// A brick that could lend, with its texels as a GPU reads them, 0 to 1.
 struct Lender {
     texels: Box<[f32; BRICK_VOXELS]>,
@@ -81,7 +84,7 @@ pub(super) fn loans(
             Comparison { batch, borrowers, lenders: lenders_of[around.clone()].concat(), around }
         })
         .collect();
-    let known: Vec<(Option<Key>, Option<Vec<Vec<Offer>>>)> =
+    let known: Vec<(Option<Key>, Option<Offers>)> =
         comparisons.par_iter().map(|comparison| comparison.known(encodings, tree)).collect();
 
     let mut near = Near::default();
@@ -121,9 +124,9 @@ struct Comparison<'a> {
 
 impl Comparison<'_> {
     /// What stands for the offers in the cache, and those that are there.
-    fn known(&self, encodings: &Encodings, tree: &SequenceTree) -> (Option<Key>, Option<Vec<Vec<Offer>>>) {
+    fn known(&self, encodings: &Encodings, tree: &SequenceTree) -> (Option<Key>, Option<Offers>) {
         let key = self.key(encodings, tree);
-        let is_sound = |offers: &Vec<Vec<Offer>>| {
+        let is_sound = |offers: &Offers| {
             offers.len() == self.borrowers.len()
                 && offers.iter().flatten().all(|offer| (offer.lender as usize) < self.lenders.len())
         };
@@ -239,7 +242,7 @@ fn coarse(values: &[f32; BRICK_VOXELS], mean: f64, energy: f64, out: &mut [f32])
 
 impl Comparison<'_> {
     /// For each borrower, whose bricks these are, the closest of the lenders.
-    fn nearest(&self, encodings: &Encodings, bricks: &[Brick], near: &Near) -> Vec<Vec<Offer>> {
+    fn nearest(&self, encodings: &Encodings, bricks: &[Brick], near: &Near) -> Offers {
         let lenders: Vec<&Lender> = near.batches.values().flatten().collect();
         let mut codebook = Array2::<f32>::zeros((lenders.len(), COARSE));
         for (lender, mut row) in lenders.iter().zip(codebook.rows_mut()) {

@@ -1,0 +1,457 @@
+//! The cache: never another pack, and as little work as possible.
+
+mod common;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+use std::sync::Arc;
+use std::time::Duration;
+
+use common::{animation, fixture};
+use serde_json::Value as Json;
+use volpack::cache::Cache;
+use volpack::pipeline::{Job, Made, Outcome, Progress, Silent, VerifyLevel, build};
+use volpack::settings::{
+    ClusterArgs, Dedup, ErrorBound, Format, Masks, NonFinite, Quality, RangeMode, Settings,
+};
+
+/// A folder with a cache and the frames of an animation that may be edited.
+struct Shop {
+    folder: tempfile::TempDir,
+    cache: Arc<Cache>,
+}
+
+impl Shop {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let cache = Arc::new(Cache::open(&folder.path().join("cache")).unwrap());
+        for file in animation() {
+            fs::copy(&file, folder.path().join(file.file_name().unwrap())).unwrap();
+        }
+        Self { folder, cache }
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    fn frames(&self) -> Vec<PathBuf> {
+        animation().iter().map(|file| self.path(&file.file_name().unwrap().to_string_lossy())).collect()
+    }
+
+    fn job(&self, frames: &[PathBuf], settings: &Settings) -> Job {
+        let output = self.path("cached.volpack");
+        let mut job = Job::new(frames.to_vec(), output, settings.clone(), VerifyLevel::None);
+        job.cache = Some(Arc::clone(&self.cache));
+        job
+    }
+
+    fn build(&self, frames: &[PathBuf], settings: &Settings) -> Outcome {
+        build(&self.job(frames, settings), &mut Silent).unwrap()
+    }
+
+    /// Builds with the cache as it is, and compares with a build without.
+    fn build_and_compare(&self, frames: &[PathBuf], settings: &Settings) -> Outcome {
+        let outcome = self.build(frames, settings);
+        let alone =
+            Job::new(frames.to_vec(), self.path("alone.volpack"), settings.clone(), VerifyLevel::None);
+        build(&alone, &mut Silent).unwrap();
+        let same = fs::read(self.path("cached.volpack")).unwrap() == fs::read(&alone.output).unwrap();
+        assert!(same, "{settings:?} of {} frames: {:?}", frames.len(), outcome.cache);
+        outcome
+    }
+}
+
+/// The files under a folder.
+fn files(folder: &Path) -> Vec<PathBuf> {
+    let entries = fs::read_dir(folder).into_iter().flatten().map(|entry| entry.unwrap().path());
+    let mut files: Vec<PathBuf> =
+        entries.flat_map(|p| if p.is_dir() { files(&p) } else { vec![p] }).collect();
+    files.sort();
+    files
+}
+
+fn of_quality(quality: Quality) -> Settings {
+    Settings { grids: vec!["density".to_owned()], quality, ..Settings::default() }
+}
+
+fn of_format(format: Format) -> Settings {
+    Settings { format, quality: Quality::default(), ..of_quality(Quality::default()) }
+}
+
+fn clusters() -> ClusterArgs {
+    ClusterArgs { dedup: Some(Dedup::Kmeans), clusters: Some(8), ..ClusterArgs::default() }
+}
+
+/// Settings that share parts of each other's work in every way.
+fn variety() -> Vec<Settings> {
+    let psnr = |db| of_quality(Quality::Psnr(db));
+    vec![
+        psnr(45.0),
+        psnr(60.0),
+        psnr(30.0),
+        psnr(46.0),
+        Settings { min_frame_psnr: Some(50.0), ..psnr(50.0) },
+        of_quality(Quality::MaxError(ErrorBound::of_range(0.01))),
+        of_quality(Quality::Size(60_000)),
+        Settings { grids: vec!["density".to_owned(), "temperature".to_owned()], ..psnr(45.0) },
+        Settings { range: RangeMode::Sequence, ..psnr(40.0) },
+        Settings { masks: Masks::Keep, ..psnr(45.0) },
+        Settings { zstd: 0, ..psnr(45.0) },
+        Settings { zstd: 19, ..psnr(46.0) },
+        Settings { nonfinite: NonFinite::Zero, ..psnr(45.0) },
+        Settings { fps: Some(24.0), ..psnr(45.0) },
+        of_format(Format::Bc7),
+        of_format(Format::Bc4),
+        of_format(Format::Unorm8),
+        of_format(Format::F16),
+        Settings { zstd: 7, ..of_format(Format::F16) },
+        of_format(Format::F32),
+        Settings { clustering: clusters().clustering(Format::Bc7).unwrap(), ..of_format(Format::Bc7) },
+    ]
+}
+
+#[test]
+fn no_order_of_builds_changes_a_pack() {
+    for reverse in [false, true] {
+        let shop = Shop::new();
+        let mut order = variety();
+        if reverse {
+            order.reverse();
+        }
+        for settings in &order {
+            shop.build_and_compare(&shop.frames(), settings);
+        }
+        // What was built first is what it was.
+        let again = shop.build_and_compare(&shop.frames(), &order[0]);
+        assert_eq!(again.made, Made::Copied);
+        assert!(shop.cache.verify().unwrap().is_empty());
+    }
+}
+
+#[test]
+fn no_choice_of_frames_changes_a_pack() {
+    let shop = Shop::new();
+    let frames = shop.frames();
+    // The first of two frames that share bricks has them: who that is depends on who else is there.
+    for choice in [&frames[..], &frames[3..], &frames[..5], &frames[2..3], &frames[..]] {
+        for settings in [&variety()[0], &variety()[5], &of_format(Format::Bc7)] {
+            shop.build_and_compare(choice, settings);
+        }
+    }
+    // Frames trade places, so that each brick has another home.
+    fs::copy(fixture("anim_0006.vdb"), shop.path("anim_0001.vdb")).unwrap();
+    fs::copy(fixture("anim_0001.vdb"), shop.path("anim_0006.vdb")).unwrap();
+    for settings in variety() {
+        shop.build_and_compare(&frames, &settings);
+    }
+}
+
+#[test]
+fn level_sets_and_backgrounds_come_out_the_same() {
+    let shop = Shop::new();
+    for (name, grid) in [
+        ("levelset_float", "surface"),
+        ("negative", "density"),
+        ("adversarial", "negative_background"),
+        ("tiles", "density"),
+        ("inactive_float", "density"),
+    ] {
+        let frames = [fixture(&format!("{name}.vdb"))];
+        for db in [40.0, 50.0, 40.5] {
+            let settings = Settings { grids: vec![grid.to_owned()], ..of_quality(Quality::Psnr(db)) };
+            shop.build_and_compare(&frames, &settings);
+        }
+    }
+}
+
+#[test]
+fn what_did_not_change_is_not_made_again() {
+    let shop = Shop::new();
+    let (mut frames, settings) = (shop.frames(), of_quality(Quality::Psnr(45.0)));
+    let late = frames.remove(3);
+    let cold = shop.build(&frames, &settings);
+    assert_eq!((cold.made, cold.cache["outline"].misses), (Made::Built, 7));
+    let again = shop.build(&frames, &settings);
+    assert_eq!(again.made, Made::Unchanged);
+    let level = shop.build(&frames, &Settings { zstd: 9, ..settings.clone() });
+    assert_eq!(level.made, Made::Repacked);
+    assert!(!level.cache.contains_key("outline"), "no stage ran");
+    fs::remove_file(shop.path("cached.volpack")).unwrap();
+    assert_eq!(shop.build(&frames, &settings).made, Made::Copied);
+
+    // Entries are counted by the batch: what this one asks for beside is added to them.
+    let coarser = shop.build(&frames, &of_quality(Quality::Psnr(44.9)));
+    assert_eq!((coarser.made, coarser.cache["outline"].misses), (Made::Built, 0));
+    assert_eq!(coarser.cache["encode"].misses, 0, "{:?}", coarser.cache);
+
+    frames.insert(3, late);
+    let more = shop.build_and_compare(&frames, &settings);
+    assert_eq!(more.cache["outline"].misses, 1);
+    // Of each frame's four kinds.
+    assert_eq!((more.cache["encode"].hits, more.cache["encode"].misses), (28, 4), "{:?}", more.cache);
+}
+
+#[test]
+fn a_verification_is_made_once_and_failures_each_time() {
+    let shop = Shop::new();
+    let verified = |settings: &Settings, frames: &[PathBuf]| {
+        let mut job = shop.job(frames, settings);
+        job.verify = VerifyLevel::Voxels;
+        build(&job, &mut Silent).unwrap()
+    };
+    let settings = of_quality(Quality::Psnr(45.0));
+    let first = verified(&settings, &shop.frames());
+    let second = verified(&settings, &shop.frames());
+    assert_eq!((first.was_verified, second.was_verified), (false, true));
+    let json = |outcome: &Outcome| serde_json::to_value(&outcome.verification).unwrap();
+    assert_eq!(json(&first), json(&second));
+
+    // One shape for all bricks of a level set flips signs.
+    let one = ClusterArgs { clusters: Some(1), variance: Some(1.0), ..clusters() };
+    let clustering = one.clustering(Format::Bc7).unwrap();
+    let flips = Settings { grids: vec!["surface".to_owned()], clustering, ..of_format(Format::Bc7) };
+    for _ in 0..2 {
+        let outcome = verified(&flips, &[fixture("levelset_half.vdb")]);
+        assert!(!outcome.was_verified && !outcome.verification.unwrap().ok);
+    }
+}
+
+/// Keeps warnings.
+#[derive(Default)]
+struct Warnings(Vec<String>);
+
+impl Progress for Warnings {
+    fn stage(&mut self, _: &'static str, _: u64, _: &'static str) {}
+    fn advance(&mut self, _: u64) {}
+    fn warn(&mut self, warning: &str) {
+        self.0.push(warning.to_owned());
+    }
+}
+
+#[test]
+fn damage_is_a_warning_and_never_another_pack() {
+    let shop = Shop::new();
+    let (frames, settings) = (shop.frames(), of_quality(Quality::Psnr(45.0)));
+    shop.build(&frames, &settings);
+    let output = shop.path("cached.volpack");
+    let expected = fs::read(&output).unwrap();
+    let folders = ["actions", "blobs"].map(|name| shop.path("cache").join(name));
+    let all: Vec<PathBuf> = folders.iter().flat_map(|folder| files(folder)).collect();
+    let is_pack = |bytes: &[u8]| bytes.starts_with(b"vpcache") && bytes[8..12] == *b"pack";
+    for (i, damaged) in all.iter().enumerate() {
+        // The pack would hide what is wrong below it.
+        for file in files(&folders[0]) {
+            if is_pack(&fs::read(&file).unwrap()) && file != *damaged {
+                fs::remove_file(file).unwrap();
+            }
+        }
+        let mut bytes = fs::read(damaged).unwrap_or_default();
+        match i % 3 {
+            0 => bytes.truncate(bytes.len() / 2),
+            1 => bytes.push(0),
+            _ => bytes.iter_mut().skip(20).step_by(50).for_each(|b| *b ^= 4),
+        }
+        fs::write(damaged, bytes).unwrap();
+        fs::remove_file(&output).unwrap();
+        let mut warnings = Warnings::default();
+        build(&shop.job(&frames, &settings), &mut warnings).unwrap();
+        assert!(fs::read(&output).unwrap() == expected, "{}", damaged.display());
+    }
+    assert!(shop.cache.verify().unwrap().is_empty(), "what was damaged is mended");
+}
+
+#[test]
+fn one_damaged_entry_is_named() {
+    let shop = Shop::new();
+    let (frames, settings) = (shop.frames(), of_quality(Quality::Psnr(45.0)));
+    shop.build(&frames, &settings);
+    for file in files(&shop.path("cache").join("blobs")) {
+        fs::write(file, "damaged").unwrap();
+    }
+    fs::remove_file(shop.path("cached.volpack")).unwrap();
+    let mut warnings = Warnings::default();
+    build(&shop.job(&frames, &settings), &mut warnings).unwrap();
+    assert!(warnings.0.len() > 8, "{:?}", warnings.0);
+    assert!(warnings.0.iter().all(|w| w.contains("blobs") && w.contains("made anew")), "{:?}", warnings.0);
+}
+
+fn volpack(folder: &Path, args: &[&str]) -> Output {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_volpack"));
+    command.env("VOLPACK_CACHE", folder.join("cache")).current_dir(folder).args(args).output().unwrap()
+}
+
+fn stdout(output: &Output) -> String {
+    assert!(output.status.success(), "{output:?}");
+    String::from_utf8(output.stdout.clone()).unwrap()
+}
+
+const MANIFEST: &str = "[asset.puff]\nframes = 'anim_*.vdb'\ngrid = 'density'\noutput = 'puff.volpack'\n";
+
+#[test]
+fn a_build_is_explained() {
+    let shop = Shop::new();
+    let folder = shop.folder.path();
+    fs::write(shop.path("pipeline.toml"), MANIFEST).unwrap();
+    let explain = || stdout(&volpack(folder, &["explain", "puff"]));
+    assert!(explain().contains("because there is no puff.volpack"));
+    stdout(&volpack(folder, &["build", "--verify", "voxels"]));
+    assert!(explain().contains("verify"), "pictures were not looked at");
+    stdout(&volpack(folder, &["build", "--device", "auto"]));
+    assert_eq!(explain(), "puff: up to date\n");
+
+    fs::copy(fixture("anim_0002.vdb"), shop.path("anim_0003.vdb")).unwrap();
+    fs::remove_file(shop.path("anim_0008.vdb")).unwrap();
+    fs::copy(fixture("fog_half_blosc.vdb"), shop.path("anim_0009.vdb")).unwrap();
+    fs::write(shop.path("pipeline.toml"), format!("{MANIFEST}psnr = 50\n")).unwrap();
+    let text = explain();
+    for line in [
+        "because quality was psnr 45 and is psnr 50",
+        "because anim_0003.vdb changed",
+        "because anim_0009.vdb came",
+        "because anim_0008.vdb went",
+        // What frame 3 is now, frame 2 was before.
+        "flatten    1 of 8 frames: anim_0009.vdb",
+    ] {
+        assert!(text.contains(line), "{line}: {text}");
+    }
+    let json: Json = serde_json::from_str(&stdout(&volpack(folder, &["explain", "--json"]))).unwrap();
+    assert_eq!(json[0]["explanation"]["stages"][0]["stage"], "flatten");
+}
+
+#[test]
+fn the_cache_is_looked_after() {
+    let shop = Shop::new();
+    let folder = shop.folder.path();
+    fs::write(shop.path("pipeline.toml"), MANIFEST).unwrap();
+    let json = |args: &[&str]| -> Json { serde_json::from_str(&stdout(&volpack(folder, args))).unwrap() };
+    let bytes = || json(&["cache", "stats", "--json"])["stats"]["bytes"].as_u64().unwrap();
+    stdout(&volpack(folder, &["build", "--verify", "none", "--no-cache"]));
+    assert_eq!(bytes(), 0);
+    stdout(&volpack(folder, &["build", "--verify", "none"]));
+    let all = bytes();
+    assert!(all > 50_000, "{all}");
+    assert_eq!(json(&["cache", "verify", "--json"])["ok"], true);
+    assert_eq!(json(&["cache", "gc", "--max-age", "1d", "--json"])["files"], 0);
+    json(&["cache", "gc", "--max-size", "40kB", "--json"]);
+    assert!(bytes() <= 40_000);
+    stdout(&volpack(folder, &["build", "--verify", "none"]));
+
+    let blob = files(&shop.path("cache").join("blobs")).pop().unwrap();
+    fs::write(&blob, "damaged").unwrap();
+    let verified = volpack(folder, &["cache", "verify"]);
+    assert_eq!(verified.status.code(), Some(3));
+    assert!(String::from_utf8_lossy(&verified.stderr).contains(&*blob.to_string_lossy()));
+    stdout(&volpack(folder, &["cache", "verify"]));
+    // What is not the cache's own stays.
+    fs::write(shop.path("cache").join("mine.txt"), "mine").unwrap();
+    stdout(&volpack(folder, &["cache", "clear"]));
+    assert_eq!(bytes(), 0);
+    assert!(shop.path("cache").join("mine.txt").exists());
+    assert_eq!(volpack(folder, &["cache", "gc"]).status.code(), Some(2), "gc of what?");
+}
+
+#[test]
+fn a_cache_that_cannot_be_is_a_warning() {
+    let shop = Shop::new();
+    fs::write(shop.path("pipeline.toml"), MANIFEST).unwrap();
+    fs::write(shop.path("file"), "").unwrap();
+    let output = volpack(shop.folder.path(), &["build", "--verify", "none", "--cache", "file/cache"]);
+    assert!(stdout(&output).contains("puff.volpack"));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("going on without a cache"));
+}
+
+#[test]
+fn processes_share_a_store() {
+    let shop = Shop::new();
+    let args = |process: usize| {
+        let psnr = ["45", "50", "55", "60"][process % 4];
+        ["build", "anim_*.vdb", "--verify", "none", "--grid", "density", "--psnr", psnr, "-o"]
+            .map(str::to_owned)
+    };
+    let start = |process: usize, output: &str, cache: &str| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_volpack"));
+        command.args(args(process)).arg(output).args(["--cache", cache]).current_dir(shop.folder.path());
+        command.stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap()
+    };
+    let running: Vec<_> = (0..8).map(|p| start(p, &format!("{p}.volpack"), "cache")).collect();
+    for (process, child) in running.into_iter().enumerate() {
+        let output = child.wait_with_output().unwrap();
+        assert!(output.status.success(), "{output:?}");
+        let alone = format!("alone-{process}.volpack");
+        let apart = start(process, &alone, &format!("cache-{process}")).wait_with_output().unwrap();
+        assert!(apart.status.success(), "{apart:?}");
+        let same = fs::read(shop.path(&format!("{process}.volpack"))).unwrap()
+            == fs::read(shop.path(&alone)).unwrap();
+        assert!(same, "process {process}");
+    }
+    assert!(shop.cache.verify().unwrap().is_empty());
+}
+
+/// Waits until a condition holds, for at most a minute.
+fn wait_until(what: &str, holds: impl Fn() -> bool) {
+    for _ in 0..600 {
+        if holds() {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(100));
+    }
+    panic!("waited for {what} in vain");
+}
+
+#[test]
+fn killed_builds_leave_a_cache_that_goes_on() {
+    let shop = Shop::new();
+    let settings = of_quality(Quality::Psnr(45.0));
+    for milliseconds in [1, 5, 10, 20, 40, 80, 120] {
+        let mut child = Command::new(env!("CARGO_BIN_EXE_volpack"))
+            .args(["build", "anim_*.vdb", "--verify", "none", "--grid", "density", "-o", "killed.volpack"])
+            .args(["--cache", "cache"])
+            .current_dir(shop.folder.path())
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap();
+        std::thread::sleep(Duration::from_millis(milliseconds));
+        child.kill().unwrap();
+        child.wait().unwrap();
+        shop.build_and_compare(&shop.frames(), &settings);
+    }
+}
+
+#[cfg(unix)]
+#[test]
+fn a_watch_builds_what_lands_and_ctrl_c_ends_it() {
+    let shop = Shop::new();
+    let folder = shop.folder.path();
+    fs::write(shop.path("pipeline.toml"), MANIFEST.replace("anim_", "in/anim_")).unwrap();
+    fs::create_dir(shop.path("in")).unwrap();
+    let log = shop.path("log");
+    let mut child = Command::new(env!("CARGO_BIN_EXE_volpack"))
+        .args(["watch", "--settle", "0.3", "--cache", "cache"])
+        .current_dir(folder)
+        .stdout(fs::File::create(&log).unwrap())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let said = |text: &str| fs::read_to_string(&log).unwrap().contains(text);
+    wait_until("a word about what it waits for", || said("waiting"));
+    let whole = fs::read(fixture("anim_0001.vdb")).unwrap();
+    // The first half stays as it is for longer than it takes to settle.
+    fs::write(shop.path("in/anim_0001.vdb"), &whole[..whole.len() / 2]).unwrap();
+    std::thread::sleep(Duration::from_millis(1000));
+    assert!(!said("kept the last good pack"), "a half-written file is waited for");
+    fs::write(shop.path("in/anim_0001.vdb"), &whole).unwrap();
+    wait_until("the first pack", || said("1 frame,"));
+    fs::copy(fixture("anim_0002.vdb"), shop.path("in/anim_0002.vdb")).unwrap();
+    wait_until("the second pack", || said("2 frames,"));
+    let good = fs::read(shop.path("puff.volpack")).unwrap();
+    fs::copy(fixture("frustum.vdb"), shop.path("in/anim_0003.vdb")).unwrap();
+    wait_until("an error", || said("kept the last good pack"));
+    assert!(fs::read(shop.path("puff.volpack")).unwrap() == good);
+
+    let pid = child.id().to_string();
+    assert!(Command::new("kill").args(["-INT", &pid]).status().unwrap().success());
+    assert!(child.wait().unwrap().success());
+}
