@@ -61,6 +61,12 @@ pub enum Error {
     /// A device that failed, or another thing that should not happen.
     #[error("{0}")]
     Other(String),
+    /// A source that changed while it was read.
+    #[error("{}: the file changed while it was being read: build again when it is complete", .0.display())]
+    Changed(PathBuf),
+    /// Something from the cache that its digest is right of and that is not what it should be.
+    #[error("the cache misled the build: {0}")]
+    Misled(String),
     /// The user ended it.
     #[error("interrupted: outputs are as they were, and what was done so far is kept for the next build")]
     Interrupted,
@@ -109,6 +115,7 @@ impl Error {
             Self::Vdb { source, .. } if source.is_unsupported() => 6,
             Self::Pack { source, .. } if source.is_unsupported() => 6,
             Self::Vdb { .. } | Self::Pack { .. } | Self::Manifest { .. } | Self::Input(_) => 3,
+            Self::Changed(_) | Self::Misled(_) => 3,
             Self::OutOfRange { .. } => 3,
             Self::Verify(_) => 4,
             Self::Unsupported(_) => 6,

@@ -8,8 +8,15 @@ use crate::error::Error;
 
 static REQUESTED: AtomicBool = AtomicBool::new(false);
 
+/// From now on Ctrl-C and what asks a process to end ask its work to end. Commands that have nothing to lose do
+/// without, and end at once.
+pub fn catch() {
+    // Where signals cannot be caught they end the process, as they always did.
+    let _ = ctrlc::set_handler(request);
+}
+
 /// Asks all work to end. The second time it ends at once.
-pub fn request() {
+fn request() {
     if REQUESTED.swap(true, Ordering::Relaxed) {
         std::process::exit(i32::from(Error::Interrupted.exit_code()));
     }

@@ -11,10 +11,7 @@ fn main() -> ExitCode {
         // error about a window system that nobody asked for.
         unsafe { std::env::set_var("XDG_RUNTIME_DIR", std::env::temp_dir()) };
     }
-    let cli = Cli::parse();
-    // Where signals cannot be caught they end the process, as they always did.
-    let _ = ctrlc::set_handler(volpack::interrupt::request);
-    match run(cli) {
+    match run(Cli::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             print_error(&error);

@@ -151,10 +151,11 @@ impl Cache {
         Ok(cleared)
     }
 
-    /// The files of one of the store's folders and of the folders in it.
-    fn files(&self, folder: &str) -> io::Result<Vec<Found>> {
+    /// The store's own files in one of its folders: whatever else someone put there is not touched.
+    fn files(&self, map: &str) -> io::Result<Vec<Found>> {
         let mut files = Vec::new();
-        let mut folders = vec![self.folder().join(folder)];
+        let root = self.folder().join(map);
+        let mut folders = vec![root.clone()];
         while let Some(folder) = folders.pop() {
             let entries = match fs::read_dir(&folder) {
                 Ok(entries) => entries,
@@ -166,8 +167,10 @@ impl Cache {
                 // What goes away while it is looked at is not there. Links are not followed.
                 let Ok(metadata) = entry.metadata() else { continue };
                 if metadata.is_dir() {
-                    folders.push(entry.path());
-                } else {
+                    if folder == root {
+                        folders.push(entry.path());
+                    }
+                } else if is_ours(&entry.path(), map) {
                     let used = metadata.modified().unwrap_or(SystemTime::UNIX_EPOCH);
                     files.push(Found { path: entry.path(), bytes: metadata.len(), used });
                 }
@@ -183,6 +186,16 @@ impl Entry {
         let bytes = fs::read(path).map_err(|e| e.to_string())?;
         Self::from_bytes(&bytes).map_err(str::to_owned)
     }
+}
+
+/// Whether a file has a name that the store gives: a digest's, or what `tempfile` calls one that is being written.
+fn is_ours(path: &Path, map: &str) -> bool {
+    if map != ASIDE {
+        return digest_in_name(path).is_some();
+    }
+    let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
+    name.strip_prefix(".tmp")
+        .is_some_and(|rest| rest.len() == 6 && rest.chars().all(|c| c.is_ascii_alphanumeric()))
 }
 
 /// The digest that a blob's file and folder are named by.

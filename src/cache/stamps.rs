@@ -57,8 +57,9 @@ impl Stamp {
         self.bytes
     }
 
-    /// Whether the file was left alone for long enough that another change would show.
-    fn is_settled(&self) -> bool {
+    /// Whether the file was left alone for long enough that another change would show. To be asked before the file is
+    /// hashed.
+    pub fn is_settled(&self) -> bool {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let changed = Duration::from_secs(self.changed.0.try_into().unwrap_or(0));
         self.modified.max(changed) + TICK < now
@@ -75,9 +76,9 @@ impl Cache {
         (found.stamp == *stamp).then(|| found.digest.into())
     }
 
-    /// Remembers the digest that a file has under a stamp, unless the file has only just been changed.
+    /// Remembers the digest that a file has under a stamp that was [settled](Stamp::is_settled) when it was taken.
     pub fn remember(&self, path: &Path, stamp: &Stamp, digest: &blake3::Hash) {
-        let Some(at) = self.stamp_path(path).filter(|_| stamp.is_settled()) else { return };
+        let Some(at) = self.stamp_path(path) else { return };
         let mut bytes = artefact::encode(&Remembered { stamp: *stamp, digest: *digest.as_bytes() });
         bytes.extend(blake3::hash(&bytes).as_bytes());
         // Nothing is lost with it but a little time, so it is not worth a sync or a warning.

@@ -5,6 +5,7 @@ use std::io::{self, Read, Write};
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
+use super::artefact;
 use super::writer::Content;
 use super::{Blob, Key};
 
@@ -137,6 +138,9 @@ impl Store {
     /// A blob's bytes; `None` where they are not there.
     pub fn read_blob(&self, blob: &Blob) -> Result<Option<Vec<u8>>, Unusable> {
         let path = self.path(Map::Blobs, &blob.digest);
+        if blob.bytes > artefact::MOST as u64 {
+            return Err(Unusable { path, why: format!("{} bytes are more than a result has", blob.bytes) });
+        }
         self.read(&path, blob.bytes, |bytes| match blake3::hash(&bytes) == blob.digest {
             true => Ok(bytes),
             false => Err("its digest is not that of its bytes"),
@@ -155,6 +159,7 @@ impl Store {
         length: u64,
         parse: impl FnOnce(Vec<u8>) -> Result<T, &'static str>,
     ) -> Result<Option<T>, Unusable> {
+        let unreadable = |e: io::Error| Unusable { path: path.to_owned(), why: e.to_string() };
         let unusable = |why: String| {
             let _ = fs::remove_file(path);
             Unusable { path: path.to_owned(), why }
@@ -162,17 +167,14 @@ impl Store {
         let mut file = match File::open(path) {
             Ok(file) => file,
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Ok(None),
-            Err(e) => return Err(unusable(e.to_string())),
+            Err(e) => return Err(unreadable(e)),
         };
-        let metadata = file.metadata().map_err(|e| unusable(e.to_string()))?;
+        let metadata = file.metadata().map_err(unreadable)?;
         if metadata.len() != length {
             return Err(unusable(format!("it has {} bytes, not {length}", metadata.len())));
         }
         let mut bytes = Vec::with_capacity(length as usize);
-        io::Read::by_ref(&mut file)
-            .take(length)
-            .read_to_end(&mut bytes)
-            .map_err(|e| unusable(e.to_string()))?;
+        io::Read::by_ref(&mut file).take(length).read_to_end(&mut bytes).map_err(unreadable)?;
         note_use(&file, &metadata);
         parse(bytes).map(Some).map_err(|why| unusable(why.to_owned()))
     }

@@ -102,6 +102,29 @@ fn what_was_not_used_for_longest_goes_first() {
 }
 
 #[test]
+fn what_is_not_the_stores_own_stays() {
+    let (folder, cache, key) = filled();
+    let mine =
+        ["tmp/mine", "blobs/aa/mine", "actions/mine/deep/file", "stamps/mine"].map(|p| folder.path().join(p));
+    for path in &mine {
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, "mine").unwrap();
+    }
+    assert!(cache.verify().unwrap().is_empty());
+    cache.collect(Some(0), Some(Duration::ZERO)).unwrap();
+    cache.clear().unwrap();
+    assert!(mine.iter().all(|path| path.exists()) && !cache.has(&key));
+}
+
+#[test]
+fn lengths_that_nothing_has_are_a_miss() {
+    for length in [1u64 << 40, u64::MAX / 2, u64::MAX] {
+        assert_eq!(artefact::decode::<String>(&length.to_le_bytes()), None);
+        assert_eq!(artefact::decode::<Vec<u64>>(&length.to_le_bytes()), None);
+    }
+}
+
+#[test]
 fn verify_finds_and_removes_what_is_damaged() {
     let (folder, cache, key) = filled();
     assert!(cache.verify().unwrap().is_empty());
@@ -120,13 +143,11 @@ fn digests_are_remembered_until_a_file_changes() {
     let path = folder.path().join("source");
     fs::write(&path, "frame").unwrap();
     let digest = blake3::hash(b"frame");
-    let fresh = Stamp::of(&path).unwrap();
-    cache.remember(&path, &fresh, &digest);
-    assert_eq!(cache.remembered(&path, &fresh), None, "it may change again within the same tick");
-
+    assert!(!Stamp::of(&path).unwrap().is_settled(), "it may change again within the same tick");
     // Nothing sets back the time at which a file's times were set: the wait is what this is about.
     std::thread::sleep(Duration::from_millis(2100));
     let stamp = Stamp::of(&path).unwrap();
+    assert!(stamp.is_settled());
     cache.remember(&path, &stamp, &digest);
     assert_eq!(cache.remembered(&path, &stamp), Some(digest));
     assert_eq!(cache.remembered(&folder.path().join("other"), &stamp), None);

@@ -9,19 +9,23 @@ use std::thread::JoinHandle;
 use super::lock;
 use super::store::{Map, Store};
 
-/// Entries that may wait: a megabyte each at most, so a slow disk slows the build before it fills memory.
+/// Entries that may wait, so that a slow disk slows the build before it fills memory: these many of that many bytes.
 const WAITING: usize = 64;
+/// Larger ones, such as the outlines of very large frames, are waited for.
+const LARGE: usize = 4 << 20;
 /// Entries that are written at a time. They wait for the disk, not for a core, and a journal syncs many at once.
 const THREADS: usize = 2;
 
 pub(super) struct Writer {
     store: Store,
-    thread: Mutex<Option<Running>>,
+    threads: Mutex<Option<Running>>,
+    /// The first failure: nothing is lost with an entry but time, so the others are written all the same.
+    failed: Arc<Mutex<Option<io::Error>>>,
 }
 
 struct Running {
     sender: SyncSender<Waiting>,
-    threads: Vec<JoinHandle<io::Result<()>>>,
+    handles: Vec<JoinHandle<()>>,
 }
 
 struct Waiting {
@@ -39,25 +43,40 @@ pub(super) enum Content {
 
 impl Writer {
     pub fn new(store: Store) -> Self {
-        Self { store, thread: Mutex::new(None) }
+        Self { store, threads: Mutex::default(), failed: Arc::default() }
     }
 
     /// Takes an entry to be written.
     pub fn write(&self, map: Map, digest: [u8; 32], content: Content) {
-        let sender = lock(&self.thread).get_or_insert_with(|| Running::new(&self.store)).sender.clone();
-        // A writer that gave up hears of nothing more.
-        let _ = sender.send(Waiting { map, digest, content });
+        let waiting = Waiting { map, digest, content };
+        if matches!(&waiting.content, Content::Bytes(bytes) if bytes.len() > LARGE) {
+            return waiting.write(&self.store, &self.failed);
+        }
+        let sender = lock(&self.threads).get_or_insert_with(|| self.start()).sender.clone();
+        // The threads end after the last sender, so someone takes it.
+        let _ = sender.send(waiting);
     }
 
-    /// Waits until all is written; the first failure, if any.
-    pub fn flush(&self) -> Option<io::Error> {
-        let Running { sender, threads } = lock(&self.thread).take()?;
-        drop(sender);
-        let join = |thread: JoinHandle<io::Result<()>>| {
-            thread.join().unwrap_or_else(|_| Err(io::Error::other("the writer panicked"))).err()
+    fn start(&self) -> Running {
+        let (sender, receiver) = sync_channel::<Waiting>(WAITING);
+        let receiver = Arc::new(Mutex::new(receiver));
+        let thread = || {
+            let (store, receiver, failed) =
+                (self.store.clone(), Arc::clone(&receiver), Arc::clone(&self.failed));
+            let next = move || lock(&receiver).recv().ok();
+            std::thread::spawn(move || std::iter::from_fn(next).for_each(|w| w.write(&store, &failed)))
         };
-        // All of them are waited for.
-        threads.into_iter().map(join).collect::<Vec<_>>().into_iter().flatten().next()
+        Running { sender, handles: (0..THREADS).map(|_| thread()).collect() }
+    }
+
+    /// Waits until all is written; the first failure since the last time, if any.
+    pub fn flush(&self) -> Option<io::Error> {
+        if let Some(Running { sender, handles }) = lock(&self.threads).take() {
+            drop(sender);
+            // A thread that panicked has said so, and cost no more than entries.
+            handles.into_iter().for_each(|handle| drop(handle.join()));
+        }
+        lock(&self.failed).take()
     }
 }
 
@@ -67,17 +86,10 @@ impl Drop for Writer {
     }
 }
 
-impl Running {
-    fn new(store: &Store) -> Self {
-        let (sender, receiver) = sync_channel::<Waiting>(WAITING);
-        let receiver = Arc::new(Mutex::new(receiver));
-        let thread = || {
-            let (store, receiver) = (store.clone(), Arc::clone(&receiver));
-            let next = move || lock(&receiver).recv().ok();
-            std::thread::spawn(move || {
-                std::iter::from_fn(next).try_for_each(|w| store.write(w.map, &w.digest, w.content))
-            })
-        };
-        Self { sender, threads: (0..THREADS).map(|_| thread()).collect() }
+impl Waiting {
+    fn write(self, store: &Store, failed: &Mutex<Option<io::Error>>) {
+        if let Err(e) = store.write(self.map, &self.digest, self.content) {
+            lock(failed).get_or_insert(e);
+        }
     }
 }

@@ -6,7 +6,7 @@ use clap::Args;
 
 use super::cache::CacheChoice;
 use super::jobs::assets;
-use super::style::{GOOD, TITLE};
+use super::style::{GOOD, TITLE, WARNING};
 use super::{outln, print_json};
 use crate::error::Result;
 use crate::manifest::{DEFAULT_NAME, expand};
@@ -51,6 +51,9 @@ pub fn run(args: &ExplainArgs) -> Result<()> {
         for stage in &explanation.stages {
             outln!("    {:10} {}", stage.stage, stage.work);
         }
+    }
+    for warning in cache.iter().flat_map(|cache| cache.flush()) {
+        anstream::eprintln!("{WARNING}warning{WARNING:#}: {warning}");
     }
     if args.json {
         print_json(&out);

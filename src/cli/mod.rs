@@ -194,6 +194,9 @@ pub fn run(cli: Cli) -> Result<()> {
             .build_global()
             .map_err(|e| Error::Usage(format!("--threads {threads}: {e}")))?;
     }
+    if matches!(cli.command, Command::Build(_) | Command::Watch(_) | Command::Verify(_)) {
+        crate::interrupt::catch();
+    }
     match cli.command {
         Command::Build(args) => build::run(&args, cli.common),
         Command::Watch(args) => watch::run(&args, cli.common),

@@ -30,11 +30,11 @@ pub struct WatchArgs {
     settle: f64,
 }
 
-/// What an asset is made from, as it was last seen.
+/// What an asset is made from and into, as it was last seen.
 #[derive(PartialEq)]
 struct Seen {
     files: Vec<(PathBuf, Option<Stamp>)>,
-    settings: Option<Settings>,
+    made: Option<(PathBuf, Settings, Option<f64>)>,
     trouble: Option<String>,
 }
 
@@ -98,10 +98,10 @@ fn look(
     let seen = match &job {
         Ok(job) => Seen {
             files: job.frames.iter().map(|file| (file.clone(), Stamp::of(file).ok())).collect(),
-            settings: Some(job.settings.clone()),
+            made: Some((job.output.clone(), job.settings.clone(), job.pictures.max_flip)),
             trouble: None,
         },
-        Err(error) => Seen { files: Vec::new(), settings: None, trouble: Some(error.to_string()) },
+        Err(error) => Seen { files: Vec::new(), made: None, trouble: Some(error.to_string()) },
     };
     let now = Instant::now();
     let asset = match assets.get_mut(name) {
@@ -131,7 +131,7 @@ fn build_one(name: &str, job: &Job, common: Common) -> bool {
     let warnings = progress.0.iter().map(|w| format!("; {WARNING}{w}{WARNING:#}")).collect::<String>();
     match outcome {
         Err(Error::Interrupted) => {}
-        Err(Error::Vdb { path, .. }) if is_being_written(&path) => return false,
+        Err(Error::Vdb { path, .. } | Error::Changed(path)) if is_being_written(&path) => return false,
         Err(error) => {
             outln!("{TITLE}{name}{TITLE:#}: {ERROR}kept the last good pack{ERROR:#}: {error}");
         }

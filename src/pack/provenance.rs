@@ -29,6 +29,13 @@ impl Provenance {
     pub fn to_json(&self) -> std::io::Result<Vec<u8>> {
         Ok(serde_json::to_vec_pretty(self)?)
     }
+
+    /// Whether a pack that says `read` of itself is the one that this would be written into. Numbers come back from
+    /// JSON as near as its reader gets them.
+    pub fn is(&self, read: &Self) -> bool {
+        let again = self.to_json().ok().and_then(|json| serde_json::from_slice::<Self>(&json).ok());
+        again.as_ref() == Some(read)
+    }
 }
 
 /// One source file.

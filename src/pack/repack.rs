@@ -47,6 +47,7 @@ pub fn repack(
         writer.begin()?;
         let chunks: Vec<usize> = chunk_range(section).collect();
         for chunks in chunks.chunks(CHUNKS_IN_FLIGHT) {
+            crate::interrupt::check()?;
             let packed: Vec<_> = chunks
                 .par_iter()
                 .map(|&chunk| {

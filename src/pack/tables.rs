@@ -75,7 +75,7 @@ pub(super) fn read_tables(bytes: &[u8]) -> Result<(Vec<Section>, Vec<Chunk>), Pa
         for (i, chunk) in entries.iter().enumerate() {
             let last = i + 1 == entries.len();
             let size_fits = if last {
-                chunk.raw_bytes <= section.chunk_bytes
+                (1..=section.chunk_bytes).contains(&chunk.raw_bytes)
             } else {
                 chunk.raw_bytes == section.chunk_bytes
             };

@@ -219,7 +219,13 @@ fn remove_left_behind(folder: &Path) {
         modified.and_then(|m| m.elapsed().ok()).is_some_and(|age| age > LEFT_BEHIND)
     };
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
-    let ours = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(PREFIX));
+    let is_ours = |entry: &std::fs::DirEntry| {
+        let name = entry.file_name().to_string_lossy().into_owned();
+        // What `tempfile` puts behind a prefix.
+        let is_random = |rest: &str| rest.len() == 6 && rest.chars().all(|c| c.is_ascii_alphanumeric());
+        name.strip_prefix(PREFIX).is_some_and(is_random)
+    };
+    let ours = entries.filter(is_ours);
     for entry in ours.filter(is_old) {
         // Tidying up must not keep anyone from building.
         let _ = std::fs::remove_file(entry.path());

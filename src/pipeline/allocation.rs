@@ -2,7 +2,7 @@
 
 use super::Progress;
 use crate::error::{Error, Result};
-use crate::settings::{Quality, Settings};
+use crate::settings::{Format, Quality, Settings};
 use crate::stages::allocate::{self, AdaptiveGrid, AllocateError, Target};
 use crate::stages::encodings::{ConstantAim, Encodings, GridCache, Terms};
 use crate::stages::serialise::{GridInput, SerialiseError, gpu_bytes, tree_bytes};
@@ -75,7 +75,8 @@ fn terms(grid: &GridInput, settings: &Settings) -> Terms {
             Quality::MaxError(_) => ConstantAim::Max,
             _ => ConstantAim::Squares,
         },
-        sign_matters: (grid.class == GridClass::LevelSet)
+        // One codec for all bricks is kept whatever it does to signs: verification says so.
+        sign_matters: (grid.class == GridClass::LevelSet && settings.format == Format::Adaptive)
             .then(|| verify::SIGN_MATTERS_VOXELS * smallest_voxel(grid)),
     }
 }

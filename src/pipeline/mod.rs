@@ -140,7 +140,11 @@ pub fn build_altered(job: &Job, alter: Alter, progress: &mut dyn Progress) -> Re
 
 fn build_with(job: &Job, alter: Option<Alter>, progress: &mut dyn Progress) -> Result<Outcome> {
     let cache = job.cache.as_ref().filter(|_| alter.is_none());
-    let outcome = build_cached(job, cache, alter, progress);
+    let mut outcome = build_cached(job, cache, alter, progress);
+    if let Err(Error::Misled(what)) = &outcome {
+        progress.warn(&format!("the cache misled the build, which begins anew without it: {what}"));
+        outcome = build_cached(job, None, alter, progress);
+    }
     // Also after an error: what was done until then is there for the next build.
     let warnings = cache.map(|cache| cache.flush()).unwrap_or_default();
     warnings.iter().for_each(|warning| progress.warn(warning));
@@ -153,6 +157,8 @@ fn build_cached(
     alter: Option<Alter>,
     progress: &mut dyn Progress,
 ) -> Result<Outcome> {
+    // Those of a build before that failed are not this one's.
+    cache.map(|cache| cache.take_uses());
     let mut clock = Clock::new();
     let (plan, warnings) = plan(job, progress)?;
     for warning in &warnings {
@@ -164,6 +170,11 @@ fn build_cached(
     clock.lap("metadata");
 
     let mut reuse = cache.map(|cache| Reuse::new(cache, &plan.provenance));
+    // Without a cache a pack of ours that cannot be read is an error; with one it may be the cache's.
+    let misled = |error: Error| match error {
+        Error::Pack { source, .. } if cache.is_some() => Error::Misled(source.to_string()),
+        error => error,
+    };
     let reused = match &mut reuse {
         Some(reuse) => reuse.find(job, &plan.provenance)?,
         None => Reused::Nothing,
@@ -180,15 +191,18 @@ fn build_cached(
     clock.lap(if made == Made::Built { "encode and serialise" } else { "reuse" });
 
     let (pack, verification, was_verified) = match reuse.as_ref().and_then(|reuse| reuse.verification(job)) {
-        Some(report) => (Pack::open(path).map_err(Error::pack(path))?, report, true),
+        Some(report) => (Pack::open(path).map_err(Error::pack(path)).map_err(misled)?, report, true),
         None => {
-            let (pack, report) = verified(job, path, progress)?;
+            let (pack, report) = verified(job, path, progress).map_err(misled)?;
             if let Some(reuse) = &reuse {
                 reuse.keep_verification(job, report.as_ref());
             }
             (pack, report, false)
         }
     };
+    if reuse.is_some() && !plan.provenance.is(&pack.provenance) {
+        return Err(Error::Misled("the pack under its key is another one".to_owned()));
+    }
     clock.lap("verify");
     let summary = PackSummary::new(&pack);
     // A mapped file cannot be renamed everywhere.
@@ -237,6 +251,8 @@ fn run_stages(
     clock.lap("flatten and dedup");
     let caches = frames::caches(&plan.sequence, &plan.selection, &job.settings, cache);
     allocation::allocate(&mut grids, &job.settings, caches, progress)?;
+    // Written while slabs are encoded.
+    save(&mut grids)?;
     clock.lap("allocate");
     let bricks: u64 = grids.iter().map(|g| u64::from(g.tree.pool.len())).sum();
     progress.stage("encode", bricks, "bricks");
@@ -244,12 +260,18 @@ fn run_stages(
     let finished =
         serialise(&job.output, &mut grids, &plan.provenance, level, |bricks| progress.advance(bricks))
             .map_err(|e| serialise_error(e, &grids, &job.output))?;
-    for grid in &mut grids {
+    save(&mut grids)?;
+    Ok(finished)
+}
+
+/// Keeps what was made of bricks.
+fn save(grids: &mut [GridInput]) -> Result<()> {
+    for grid in grids {
         if let Some(allocation) = &mut grid.allocation {
             allocation.encodings.save(&grid.tree).map_err(Error::io(std::env::temp_dir()))?;
         }
     }
-    Ok(finished)
+    Ok(())
 }
 
 /// Opens a pack and checks as much of it as the job asks.

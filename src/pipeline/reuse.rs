@@ -5,7 +5,8 @@ use std::path::Path;
 use super::{Job, Made, VerifyLevel};
 use crate::cache::{Blob, Cache, Key, Stage, Stamp};
 use crate::error::{Error, Result};
-use crate::pack::{FinishedPack, Pack, Provenance, repack};
+use crate::pack::{FinishedPack, Pack, PackError, Provenance, repack};
+use crate::settings::Settings;
 use crate::stages::metadata::digest;
 use crate::verify::VerifyReport;
 
@@ -37,7 +38,9 @@ impl<'a> Reuse<'a> {
     pub fn new(cache: &'a Cache, provenance: &Provenance) -> Self {
         let mut any = provenance.clone();
         any.settings.zstd = 0;
-        let key = |stage, provenance: &Provenance| Key::new(stage, &provenance.to_json().unwrap_or_default());
+        let key = |stage, provenance: &Provenance| {
+            Key::new(stage, &provenance.to_json().expect("settings are finite numbers"))
+        };
         Self { cache, exact: key(&PACK, provenance), any_level: key(&ANY_LEVEL, &any), pack: None }
     }
 
@@ -76,9 +79,12 @@ impl<'a> Reuse<'a> {
             return false;
         }
         let known = self.cache.remembered(path, &stamp).filter(|_| !paranoid);
+        let is_settled = stamp.is_settled();
         let digest = known.or_else(|| {
             let (digest, _) = digest(path).ok()?;
-            self.cache.remember(path, &stamp, &digest);
+            if is_settled {
+                self.cache.remember(path, &stamp, &digest);
+            }
             Some(digest)
         });
         digest.is_some_and(|digest| digest == blob.digest)
@@ -93,10 +99,19 @@ impl<'a> Reuse<'a> {
         let Some(blob) = self.cache.blob(&self.any_level) else { return Ok(Reused::Nothing) };
         let Some(copy) = self.copy(job, &blob)? else { return Ok(Reused::Nothing) };
         let level = (job.settings.zstd != 0).then_some(job.settings.zstd);
-        // The blob's digest was right, so it is a pack, or the entry is another program's and no use.
-        let Ok(pack) = Pack::open(copy.path()) else { return Ok(Reused::Nothing) };
-        let pack = repack(&pack, &job.output, provenance, level).map_err(Error::pack(&job.output))?;
-        Ok(Reused::Pack(Made::Repacked, pack))
+        // Its digest was right; whether it is the pack that its key says is another matter.
+        let any_level = |provenance: &Provenance| {
+            let settings = Settings { zstd: 0, ..provenance.settings.clone() };
+            Provenance { settings, ..provenance.clone() }
+        };
+        let pack = Pack::open(copy.path()).ok();
+        let pack = pack.filter(|pack| any_level(provenance).is(&any_level(&pack.provenance)));
+        let pack = pack.map(|pack| repack(&pack, &job.output, provenance, level)).transpose();
+        match pack {
+            Ok(Some(pack)) => Ok(Reused::Pack(Made::Repacked, pack)),
+            Err(PackError::Io(e)) => Err(Error::io(&job.output)(e)),
+            Ok(None) | Err(_) => Ok(Reused::Nothing),
+        }
     }
 
     /// Keeps a pack that was made.
@@ -116,7 +131,11 @@ impl<'a> Reuse<'a> {
 
     /// Keeps what verification found. Failures are found again.
     pub fn keep_verification(&self, job: &Job, report: Option<&VerifyReport>) {
-        if let Some(key) = self.verify_key(job).filter(|_| report.is_none_or(|report| report.ok)) {
+        // Without a GPU or its driver half of the pictures are left out: there may be one next time.
+        let is_whole = |report: &VerifyReport| {
+            report.ok && report.pictures.as_ref().is_none_or(|pictures| pictures.skipped.is_none())
+        };
+        if let Some(key) = self.verify_key(job).filter(|_| report.is_none_or(is_whole)) {
             self.cache.put(&key, &report);
         }
     }

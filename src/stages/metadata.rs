@@ -20,6 +20,8 @@ pub struct FrameSource {
     pub digest: blake3::Hash,
     /// What tells whether it is still the file that it was.
     pub stamp: Stamp,
+    /// Whether that tells it for sure: not of a file that was changed a moment before.
+    pub is_settled: bool,
     /// The grids in it.
     pub grids: Vec<GridInfo>,
 }
@@ -35,13 +37,16 @@ impl FrameSource {
     /// # Errors
     /// When it did.
     pub fn check_unchanged(&self) -> Result<()> {
-        match Stamp::of(&self.path).map_err(Error::io(&self.path))? == self.stamp {
-            true => Ok(()),
-            false => Err(Error::Input(format!(
-                "{}: the file changed while it was being read: build again when it is complete",
-                self.path.display()
-            ))),
+        self.check_stamp()?;
+        if !self.is_settled && digest(&self.path)?.0 != self.digest {
+            return Err(Error::Changed(self.path.clone()));
         }
+        Ok(())
+    }
+
+    fn check_stamp(&self) -> Result<()> {
+        let now = Stamp::of(&self.path).map_err(Error::io(&self.path))?;
+        if now == self.stamp { Ok(()) } else { Err(Error::Changed(self.path.clone())) }
     }
 }
 
@@ -97,19 +102,23 @@ pub fn read(paths: &[PathBuf], digests: Digests) -> Result<SequenceInfo> {
 fn read_one(path: &Path, number: i32, digests: Digests) -> Result<FrameSource> {
     let stamp = Stamp::of(path).map_err(Error::io(path))?;
     let file = VdbFile::open(path).map_err(Error::vdb(path))?;
-    let digest = digests.of(path, &stamp)?;
-    Ok(FrameSource { path: path.to_owned(), number, digest, stamp, grids: file.grids })
+    let is_settled = stamp.is_settled();
+    let digest = digests.of(path, &stamp, is_settled)?;
+    let source = FrameSource { path: path.to_owned(), number, digest, stamp, is_settled, grids: file.grids };
+    // What was read and what was hashed are one file.
+    source.check_stamp()?;
+    Ok(source)
 }
 
 impl Digests<'_> {
     /// The digest of a file with this stamp.
-    fn of(self, path: &Path, stamp: &Stamp) -> Result<blake3::Hash> {
+    fn of(self, path: &Path, stamp: &Stamp, is_settled: bool) -> Result<blake3::Hash> {
         let remembered = self.cache.filter(|_| !self.paranoid).and_then(|c| c.remembered(path, stamp));
         if let Some(digest) = remembered {
             return Ok(digest);
         }
         let (digest, _) = digest(path)?;
-        if let Some(cache) = self.cache {
+        if let Some(cache) = self.cache.filter(|_| is_settled) {
             cache.remember(path, stamp, &digest);
         }
         Ok(digest)

@@ -105,6 +105,12 @@ impl BrickPool {
         (id, false)
     }
 
+    /// Whether a brick of the source is the one that this number stands for.
+    pub fn is_digest_of(&self, id: u32, brick: &Brick) -> bool {
+        let brick = Brick { keeps_mask: self.bricks[id as usize].keeps_mask, ..brick.clone() };
+        self.by_hash.get(&Self::digest(&brick)) == Some(&id)
+    }
+
     /// Where a brick comes from.
     pub fn home(&self, id: u32) -> Home {
         self.bricks[id as usize].home

@@ -90,6 +90,7 @@ pub(super) fn loans(
     let mut near = Near::default();
     let mut found = Vec::with_capacity(borrowers.len());
     for (comparison, (key, known)) in comparisons.iter().zip(known) {
+        crate::interrupt::check()?;
         let offers = match known {
             Some(offers) => offers,
             None => {
@@ -128,7 +129,10 @@ impl Comparison<'_> {
         let key = self.key(encodings, tree);
         let is_sound = |offers: &Offers| {
             offers.len() == self.borrowers.len()
-                && offers.iter().flatten().all(|offer| (offer.lender as usize) < self.lenders.len())
+                && offers.iter().flatten().all(|offer| {
+                    let extent = BrickRange::from_word(offer.range).extent;
+                    (offer.lender as usize) < self.lenders.len() && extent.is_finite() && extent > f16::ZERO
+                })
         };
         (key, key.and_then(|key| encodings.cache()?.get(&key)).filter(is_sound))
     }
@@ -136,7 +140,7 @@ impl Comparison<'_> {
     /// What the offers depend on; `None` where nothing is cached.
     fn key(&self, encodings: &Encodings, tree: &SequenceTree) -> Option<Key> {
         let batches = &encodings.batches()[self.around.clone()];
-        let keys: Option<Vec<[u8; 32]>> = batches.iter().map(|b| b.key.map(|key| *key.digest())).collect();
+        let keys: Option<Vec<[u8; 32]>> = batches.iter().map(|b| b.base.map(|key| *key.digest())).collect();
         let place = |id: u32| tree.pool.home(id).brick;
         let borrowers: Vec<(u32, u64)> =
             self.borrowers.iter().map(|&id| (place(id), active(tree, id))).collect();

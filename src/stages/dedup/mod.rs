@@ -12,6 +12,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
+use crate::error::Error;
 use crate::volume::{
     Brick, BrickPool, CellContent, Child, Constant, Coord, FrameStats, Home, InactiveRule, Interner, Mask512,
     ValueRange, bits,
@@ -199,6 +200,18 @@ impl SequenceTree {
         Ok(())
     }
 
+    /// The same for voxels that were fetched for an outline from elsewhere: they must be those that it tells of.
+    fn put_fetched(&mut self, frame: usize, voxels: &[Brick]) -> io::Result<()> {
+        let own = self.own_bricks[frame].clone();
+        let pool = &self.pool;
+        let is_told =
+            |id: u32| voxels.get(pool.home(id).brick as usize).is_some_and(|b| pool.is_digest_of(id, b));
+        if !own.into_par_iter().all(is_told) {
+            return Err(io::Error::other(Error::Misled("the outline of a frame is not its own".to_owned())));
+        }
+        self.put_voxels(frame, voxels)
+    }
+
     /// Appends some bricks of the pool to `out`. Frames whose voxels are not there are read for it, whole.
     ///
     /// # Errors
@@ -212,7 +225,7 @@ impl SequenceTree {
                 self.fetch.as_ref().expect("frames without voxels are added with a way to fetch them");
             let fetched: Vec<_> = frames.par_iter().map(|&frame| fetch(frame)).collect();
             for (&frame, voxels) in frames.iter().zip(fetched) {
-                self.put_voxels(frame, &voxels?)?;
+                self.put_fetched(frame, &voxels?)?;
             }
         }
         self.pool.read(ids, out)

@@ -90,9 +90,11 @@ impl Outline {
                 in_order && numbered && children.last().is_none_or(|(place, _)| *place < 4096)
             }
         }) && next as usize == self.bricks.len()
+            && self.bricks.iter().all(BrickOutline::is_sound)
             && self.cells.is_sorted_by(|a, b| a.origin < b.origin)
             && self.cells.iter().all(|cell| cell.origin.is_aligned(CELL_DIM))
             && self.roots.iter().all(|(origin, _)| origin.is_aligned(ROOT_DIM))
+            && self.roots.is_sorted_by(|a, b| a.0 < b.0)
     }
 
     /// Whether there is nothing in it.
@@ -102,6 +104,18 @@ impl Outline {
 }
 
 impl BrickOutline {
+    fn is_sound(&self) -> bool {
+        let in_order = match self.values {
+            Values::Constant(_) => true,
+            Values::Varied(range, _) => {
+                range.min.is_finite() && range.max.is_finite() && range.min <= range.max
+            }
+        };
+        in_order
+            && self.minus.is_some() == (self.rule == InactiveRule::Sign)
+            && (self.keeps_mask || self.rule == InactiveRule::Texel)
+    }
+
     fn new(brick: &mut Brick, background: f32, policy: MaskPolicy) -> Self {
         let (rule, minus) = brick.inactive_rule(background);
         let drop = match policy {

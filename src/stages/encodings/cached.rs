@@ -21,6 +21,7 @@ use crate::stages::dedup::SequenceTree;
 pub const BATCH_BRICKS: u32 = 2048;
 
 const STAGE: Stage = Stage { name: "encode", version: 1 };
+const BASE: Stage = Stage { name: "batch", version: 1 };
 
 /// Where the results of one grid's frames are kept.
 #[derive(Clone)]
@@ -33,8 +34,9 @@ pub struct GridCache {
 
 /// Some bricks of one frame.
 pub struct Batch {
-    /// What stands for the frame and the batch's place in it; `None` where nothing is cached.
-    pub key: Option<Key>,
+    /// What stands for the frame, the batch's place in it and all that its encodings depend on; `None` where nothing is
+    /// cached.
+    pub base: Option<Key>,
     /// The bricks of the pool that the frame had first and that are in this part of it.
     pub ids: Range<u32>,
     /// Whether the entries of each kind were looked for, and whether they lack something.
@@ -97,9 +99,7 @@ impl Kind {
 
 impl Batch {
     fn key(&self, kind: Kind) -> Option<Key> {
-        // The blocks of intel_tex_2 depend on what the machine can do.
-        let isa = (kind == Kind::Texels(KeptCodec::Bc7)).then(encoder_isa);
-        self.key.map(|key| Key::new(&STAGE, &(key.digest(), kind, isa)))
+        self.base.map(|base| Key::new(&STAGE, &(base.digest(), kind)))
     }
 }
 
@@ -144,12 +144,13 @@ impl Batches {
             let own: Vec<u32> = own.clone().collect();
             let part = |id: &u32| tree.pool.home(*id).brick / BATCH_BRICKS;
             for ids in own.chunk_by(|a, b| part(a) == part(b)) {
-                let key = cache.as_ref().map(|cache| {
+                let base = cache.as_ref().map(|cache| {
                     let outline = cache.frames[frame].digest();
                     let range = [sequence.lo, sequence.span].map(f32::to_bits);
-                    Key::new(&STAGE, &(outline, part(&ids[0]), range, terms))
+                    // The blocks of intel_tex_2, and what is fitted to them, depend on what the machine can do.
+                    Key::new(&BASE, &(outline, part(&ids[0]), range, terms, encoder_isa()))
                 });
-                all.push(Batch { key, ids: ids[0]..ids[ids.len() - 1] + 1, states: Default::default() });
+                all.push(Batch { base, ids: ids[0]..ids[ids.len() - 1] + 1, states: Default::default() });
             }
         }
         Self { all, cache }
@@ -176,7 +177,7 @@ impl Entry {
         lengths == expected
             && self.bytes.len() == count * kind.size()
             && self.places.is_sorted_by(|a, b| a < b)
-            && self.axes.iter().all(|axis| *axis < 3)
+            && self.axes.iter().all(|&axis| axis == 2 || (axis < 2 && kind == Kind::Texels(KeptCodec::Bc7)))
     }
 
     fn push_from(&mut self, other: &Self, i: usize, size: usize) {
