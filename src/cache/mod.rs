@@ -2,7 +2,8 @@
 //!
 //! Two maps on disk. An *action* says what a stage gives for some inputs: under the [`Key`] of the inputs stands the
 //! digest and the length of the result. A *blob* is a result under its own digest. Both are checked on every read, so
-//! an entry that is damaged, cut short or of another version is a miss, never a wrong pack; both are written aside,
+//! an entry that is damaged, cut short or of another version is a miss, never a wrong pack (whoever can write to a store
+//! can forge an entry with right digests, and is trusted); both are written aside,
 //! synced and renamed, so any number of processes may share one store without locks.
 //!
 //! A cache never fails a build. What goes wrong is a warning.

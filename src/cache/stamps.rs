@@ -61,7 +61,8 @@ impl Stamp {
     /// hashed.
     pub fn is_settled(&self) -> bool {
         let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        let changed = Duration::from_secs(self.changed.0.try_into().unwrap_or(0));
+        let (seconds, nanoseconds) = self.changed;
+        let changed = Duration::new(seconds.try_into().unwrap_or(0), nanoseconds.try_into().unwrap_or(0));
         self.modified.max(changed) + TICK < now
     }
 }

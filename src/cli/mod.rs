@@ -33,7 +33,8 @@ Exit codes:
   3  a file that cannot be read or is invalid
   4  verification failed: a pack does not say what its source says
   5  over budget
-  6  not supported here: a grid type, file version or device";
+  6  not supported here: a grid type, file version or device
+  130  ended by Ctrl-C: outputs are as they were";
 
 /// Turns OpenVDB volumes and animation sequences into game-ready volume packs, and proves each pack
 /// against its source.

@@ -7,7 +7,7 @@ use crate::cache::{Blob, Cache, Key, Stage, Stamp};
 use crate::error::{Error, Result};
 use crate::pack::{FinishedPack, Pack, PackError, Provenance, repack};
 use crate::settings::Settings;
-use crate::stages::metadata::digest;
+use crate::stages::metadata::{Digests, digest};
 use crate::verify::VerifyReport;
 
 const PACK: Stage = Stage { name: "pack", version: 1 };
@@ -24,6 +24,12 @@ pub(super) struct Reuse<'a> {
     pack: Option<Blob>,
 }
 
+/// What packs that differ in their level of zstd have in common.
+fn any_level(provenance: &Provenance) -> Provenance {
+    let settings = Settings { zstd: 0, ..provenance.settings.clone() };
+    Provenance { settings, ..provenance.clone() }
+}
+
 /// What it had.
 pub(super) enum Reused {
     Nothing,
@@ -36,12 +42,15 @@ pub(super) enum Reused {
 impl<'a> Reuse<'a> {
     /// A pack's bytes depend on its provenance, and on nothing that is not in it.
     pub fn new(cache: &'a Cache, provenance: &Provenance) -> Self {
-        let mut any = provenance.clone();
-        any.settings.zstd = 0;
         let key = |stage, provenance: &Provenance| {
             Key::new(stage, &provenance.to_json().expect("settings are finite numbers"))
         };
-        Self { cache, exact: key(&PACK, provenance), any_level: key(&ANY_LEVEL, &any), pack: None }
+        Self {
+            cache,
+            exact: key(&PACK, provenance),
+            any_level: key(&ANY_LEVEL, &any_level(provenance)),
+            pack: None,
+        }
     }
 
     /// The pack, if it is there already, in the cache, or there at another level of zstd.
@@ -78,16 +87,8 @@ impl<'a> Reuse<'a> {
         if stamp.bytes() != blob.bytes {
             return false;
         }
-        let known = self.cache.remembered(path, &stamp).filter(|_| !paranoid);
-        let is_settled = stamp.is_settled();
-        let digest = known.or_else(|| {
-            let (digest, _) = digest(path).ok()?;
-            if is_settled {
-                self.cache.remember(path, &stamp, &digest);
-            }
-            Some(digest)
-        });
-        digest.is_some_and(|digest| digest == blob.digest)
+        let digests = Digests { cache: Some(self.cache), paranoid };
+        digests.of(path, &stamp, stamp.is_settled()).is_ok_and(|digest| digest == blob.digest)
     }
 
     fn copy(&self, job: &Job, blob: &Blob) -> Result<Option<FinishedPack>> {
@@ -100,10 +101,6 @@ impl<'a> Reuse<'a> {
         let Some(copy) = self.copy(job, &blob)? else { return Ok(Reused::Nothing) };
         let level = (job.settings.zstd != 0).then_some(job.settings.zstd);
         // Its digest was right; whether it is the pack that its key says is another matter.
-        let any_level = |provenance: &Provenance| {
-            let settings = Settings { zstd: 0, ..provenance.settings.clone() };
-            Provenance { settings, ..provenance.clone() }
-        };
         let pack = Pack::open(copy.path()).ok();
         let pack = pack.filter(|pack| any_level(provenance).is(&any_level(&pack.provenance)));
         let pack = pack.map(|pack| repack(&pack, &job.output, provenance, level)).transpose();

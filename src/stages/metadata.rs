@@ -111,8 +111,11 @@ fn read_one(path: &Path, number: i32, digests: Digests) -> Result<FrameSource> {
 }
 
 impl Digests<'_> {
-    /// The digest of a file with this stamp.
-    fn of(self, path: &Path, stamp: &Stamp, is_settled: bool) -> Result<blake3::Hash> {
+    /// The digest of a file with this stamp, which was settled or not when it was taken.
+    ///
+    /// # Errors
+    /// When the file cannot be read.
+    pub fn of(self, path: &Path, stamp: &Stamp, is_settled: bool) -> Result<blake3::Hash> {
         let remembered = self.cache.filter(|_| !self.paranoid).and_then(|c| c.remembered(path, stamp));
         if let Some(digest) = remembered {
             return Ok(digest);

@@ -1,4 +1,4 @@
-//! The eight stages, one file each. A stage knows only its neighbours' types:
+//! The eight stages, one room each. A stage knows only its neighbours' types:
 //!
 //! | | stage | gives |
 //! |---|---|---|
@@ -6,6 +6,7 @@
 //! | 2 | [`select`] | [`select::Selection`]: the grids to pack, and their frames |
 //! | 3 | [`flatten`] | [`crate::volume::FlatFrame`]: cells and bricks of one frame |
 //! | 4 | [`dedup`] | [`dedup::SequenceTree`]: nodes and bricks shared across the sequence |
+//! | 5, 7 | [`encodings`] | what each codec makes of each brick, made once or taken from the cache |
 //! | 5 | [`allocate`] | [`allocate::Allocation`]: which codec each brick gets, and its range |
 //! | 6 | [`relayout`] | [`relayout::Layout`]: where each brick lies in the pages of its codec's texture |
 //! | 7 | [`quantise`] | encoded slabs of each atlas |
