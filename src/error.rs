@@ -75,6 +75,13 @@ pub enum Error {
     Verify(String),
 }
 
+impl From<Error> for std::io::Error {
+    /// For readers whose errors are the system's; [`Error::io`] takes it out again.
+    fn from(error: Error) -> Self {
+        Self::other(error)
+    }
+}
+
 /// `Result` with an [`Error`].
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 

@@ -1,10 +1,9 @@
 //! Ctrl-C: work ends at its next step as it does after an error, so that nothing half-made is left behind and what was
 //! done is kept.
 
-use std::io;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use crate::error::Error;
+use crate::error::{Error, Result};
 
 static REQUESTED: AtomicBool = AtomicBool::new(false);
 
@@ -30,7 +29,7 @@ pub fn is_requested() -> bool {
 /// For the steps of long work.
 ///
 /// # Errors
-/// [`Error::Interrupted`], inside, when work is to end.
-pub fn check() -> io::Result<()> {
-    if is_requested() { Err(io::Error::other(Error::Interrupted)) } else { Ok(()) }
+/// [`Error::Interrupted`] when work is to end.
+pub fn check() -> Result<()> {
+    if is_requested() { Err(Error::Interrupted) } else { Ok(()) }
 }

@@ -33,6 +33,7 @@
 //! # Ok::<(), volpack::error::Error>(())
 //! ```
 
+mod aside;
 pub mod cache;
 pub mod cli;
 pub mod codec;

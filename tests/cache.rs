@@ -223,8 +223,6 @@ fn a_verification_is_made_once_and_failures_each_time() {
 struct Warnings(Vec<String>);
 
 impl Progress for Warnings {
-    fn stage(&mut self, _: &'static str, _: u64, _: &'static str) {}
-    fn advance(&mut self, _: u64) {}
     fn warn(&mut self, warning: &str) {
         self.0.push(warning.to_owned());
     }

@@ -43,9 +43,4 @@ impl Cache {
         }
         Ok(is_whole)
     }
-
-    /// Counts a file that was, or was not, where it was looked for.
-    pub fn count_file(&self, key: &Key, hit: bool) {
-        self.count(key, hit);
-    }
 }

@@ -11,9 +11,7 @@ use serde::Serialize;
 
 use super::Cache;
 use super::store::{ASIDE, Entry, Map, STAMPS};
-
-/// Files that were being written this long ago were left by a process that was killed.
-const LEFT_BEHIND: Duration = Duration::from_secs(24 * 3600);
+use crate::aside::{LEFT_BEHIND, is_temporary};
 
 /// What is in a store.
 #[derive(Clone, Debug, Default, Serialize)]
@@ -101,9 +99,7 @@ impl Cache {
         }
         gone.extend(self.files(ASIDE)?.into_iter().filter(|found| age(found) > LEFT_BEHIND));
         gone.extend(self.files(STAMPS)?.into_iter().filter(|f| max_age.is_some_and(|max| age(f) > max)));
-        // Another process may have been quicker.
-        let removed = gone.iter().filter(|found| fs::remove_file(&found.path).is_ok());
-        Ok(removed.fold((0, 0), |(files, bytes), found| (files + 1, bytes + found.bytes)))
+        Ok(remove(&gone))
     }
 
     /// Reads every entry, and removes those that are damaged.
@@ -114,13 +110,11 @@ impl Cache {
         let actions = self.files(Map::Actions.folder())?;
         let blobs = self.files(Map::Blobs.folder())?;
         let sound_action = |found: &Found| Entry::read(&found.path).map(drop);
-        let sound_blob = |found: &Found| match digest_in_name(&found.path) {
-            None => Err("its name is no digest".to_owned()),
-            Some(named) => {
-                let mut hasher = blake3::Hasher::new();
-                hasher.update_mmap(&found.path).map_err(|e| e.to_string())?;
-                if hasher.finalize() == named { Ok(()) } else { Err("its digest is not its name".to_owned()) }
-            }
+        let sound_blob = |found: &Found| {
+            let mut hasher = blake3::Hasher::new();
+            hasher.update_mmap(&found.path).map_err(|e| e.to_string())?;
+            let is_named = digest_in_name(&found.path) == Some(hasher.finalize());
+            if is_named { Ok(()) } else { Err("its digest is not its name".to_owned()) }
         };
         let mut damaged: Vec<Damage> = Vec::new();
         let damage = |found: &Found, sound: Result<(), String>| {
@@ -140,15 +134,11 @@ impl Cache {
     /// # Errors
     /// When a folder of the store cannot be listed.
     pub fn clear(&self) -> io::Result<(u64, u64)> {
-        let mut cleared = (0, 0);
+        let mut all = Vec::new();
         for folder in [Map::Actions.folder(), Map::Blobs.folder(), STAMPS, ASIDE] {
-            for found in self.files(folder)? {
-                if fs::remove_file(&found.path).is_ok() {
-                    cleared = (cleared.0 + 1, cleared.1 + found.bytes);
-                }
-            }
+            all.extend(self.files(folder)?);
         }
-        Ok(cleared)
+        Ok(remove(&all))
     }
 
     /// The store's own files in one of its folders: whatever else someone put there is not touched.
@@ -181,6 +171,12 @@ impl Cache {
     }
 }
 
+/// Removes files, as far as another process was not quicker. Gives their number and their bytes.
+fn remove(files: &[Found]) -> (u64, u64) {
+    let removed = files.iter().filter(|found| fs::remove_file(&found.path).is_ok());
+    removed.fold((0, 0), |(files, bytes), found| (files + 1, bytes + found.bytes))
+}
+
 impl Entry {
     fn read(path: &Path) -> Result<Self, String> {
         let bytes = fs::read(path).map_err(|e| e.to_string())?;
@@ -190,12 +186,7 @@ impl Entry {
 
 /// Whether a file has a name that the store gives: a digest's, or what `tempfile` calls one that is being written.
 fn is_ours(path: &Path, map: &str) -> bool {
-    if map != ASIDE {
-        return digest_in_name(path).is_some();
-    }
-    let name = path.file_name().map(|name| name.to_string_lossy().into_owned()).unwrap_or_default();
-    name.strip_prefix(".tmp")
-        .is_some_and(|rest| rest.len() == 6 && rest.chars().all(|c| c.is_ascii_alphanumeric()))
+    if map == ASIDE { is_temporary(path, ".tmp") } else { digest_in_name(path).is_some() }
 }
 
 /// The digest that a blob's file and folder are named by.

@@ -2,9 +2,9 @@
 //!
 //! Two maps on disk. An *action* says what a stage gives for some inputs: under the [`Key`] of the inputs stands the
 //! digest and the length of the result. A *blob* is a result under its own digest. Both are checked on every read, so
-//! an entry that is damaged, cut short or of another version is a miss, never a wrong pack (whoever can write to a store
-//! can forge an entry with right digests, and is trusted); both are written aside,
-//! synced and renamed, so any number of processes may share one store without locks.
+//! an entry that is damaged, cut short or of another version is a miss, never a wrong pack. Whoever can write to a store
+//! can forge an entry with right digests, and is trusted. Both are written aside, synced and renamed, so any number of
+//! processes may share one store without locks.
 //!
 //! A cache never fails a build. What goes wrong is a warning.
 
@@ -139,7 +139,8 @@ impl Cache {
         std::mem::take(&mut *lock(&self.uses))
     }
 
-    fn count(&self, key: &Key, hit: bool) {
+    /// Counts a result that was, or was not, where it was looked for. [`Cache::get`] does so itself.
+    pub fn count(&self, key: &Key, hit: bool) {
         let mut uses = lock(&self.uses);
         let uses = uses.entry(key.stage()).or_default();
         if hit { uses.hits += 1 } else { uses.misses += 1 }

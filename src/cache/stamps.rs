@@ -4,7 +4,7 @@
 
 use std::fs::{self, Metadata};
 use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use serde::{Deserialize, Serialize};
@@ -72,24 +72,21 @@ impl Cache {
     pub fn remembered(&self, path: &Path, stamp: &Stamp) -> Option<blake3::Hash> {
         // A stamp that is damaged is as good as none: hashing the file once more is all it costs.
         let bytes = fs::read(self.stamp_path(path)?).ok()?;
-        let (body, check) = bytes.split_last_chunk::<32>()?;
-        let found: Remembered = (blake3::hash(body) == *check).then(|| artefact::decode(body))??;
+        let found: Remembered = artefact::decode(store::unseal(&bytes).ok()?)?;
         (found.stamp == *stamp).then(|| found.digest.into())
     }
 
     /// Remembers the digest that a file has under a stamp that was [settled](Stamp::is_settled) when it was taken.
     pub fn remember(&self, path: &Path, stamp: &Stamp, digest: &blake3::Hash) {
         let Some(at) = self.stamp_path(path) else { return };
-        let mut bytes = artefact::encode(&Remembered { stamp: *stamp, digest: *digest.as_bytes() });
-        bytes.extend(blake3::hash(&bytes).as_bytes());
+        let remembered = Remembered { stamp: *stamp, digest: *digest.as_bytes() };
+        let bytes = store::seal(artefact::encode(&remembered));
         // Nothing is lost with it but a little time, so it is not worth a sync or a warning.
         let _ = fs::create_dir_all(at.parent().unwrap_or(self.folder())).and_then(|()| fs::write(at, bytes));
     }
 
-    fn stamp_path(&self, path: &Path) -> Option<std::path::PathBuf> {
+    fn stamp_path(&self, path: &Path) -> Option<PathBuf> {
         let path = std::path::absolute(path).ok()?;
-        let name = blake3::hash(path.as_os_str().as_encoded_bytes()).to_hex();
-        let (folder, name) = name.split_at(2);
-        Some(self.folder().join(store::STAMPS).join(folder).join(name))
+        Some(self.store.place(store::STAMPS, &blake3::hash(path.as_os_str().as_encoded_bytes())))
     }
 }

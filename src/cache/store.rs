@@ -66,17 +66,11 @@ impl Entry {
     }
 
     pub fn to_bytes(self) -> Vec<u8> {
-        let mut bytes = [&MAGIC[..], &self.stage, &self.blob.digest, &self.blob.bytes.to_le_bytes()].concat();
-        bytes.extend(blake3::hash(&bytes).as_bytes());
-        bytes
+        seal([&MAGIC[..], &self.stage, &self.blob.digest, &self.blob.bytes.to_le_bytes()].concat())
     }
 
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, &'static str> {
-        let (body, digest) = bytes.split_last_chunk::<32>().ok_or("it is cut short")?;
-        if blake3::hash(body) != *digest {
-            return Err("its digest is not that of its bytes");
-        }
-        let mut body = body;
+        let mut body = unseal(bytes)?;
         let mut take = |buffer: &mut [u8]| body.read_exact(buffer).map_err(|_| "it is cut short");
         let (mut magic, mut stage, mut digest, mut length) = ([0; 8], [0; NAME_BYTES], [0; 32], [0; 8]);
         take(&mut magic)?;
@@ -88,6 +82,18 @@ impl Entry {
         take(&mut length)?;
         Ok(Self { stage, blob: Blob { digest, bytes: u64::from_le_bytes(length) } })
     }
+}
+
+/// Bytes with their BLAKE3 behind them.
+pub(super) fn seal(mut bytes: Vec<u8>) -> Vec<u8> {
+    bytes.extend(blake3::hash(&bytes).as_bytes());
+    bytes
+}
+
+/// The inverse of [`seal`].
+pub(super) fn unseal(bytes: &[u8]) -> Result<&[u8], &'static str> {
+    let (body, digest) = bytes.split_last_chunk::<32>().ok_or("it is cut short")?;
+    if blake3::hash(body) == *digest { Ok(body) } else { Err("its digest is not that of its bytes") }
 }
 
 /// An entry that cannot be used.
@@ -119,10 +125,15 @@ impl Store {
     }
 
     pub fn path(&self, map: Map, digest: &[u8; 32]) -> PathBuf {
-        let name = blake3::Hash::from(*digest).to_hex();
+        self.place(map.folder(), &blake3::Hash::from(*digest))
+    }
+
+    /// The file that a digest names in one of the store's folders.
+    pub fn place(&self, folder: &str, digest: &blake3::Hash) -> PathBuf {
+        let name = digest.to_hex();
         // 256 folders, so that none of them has more files than file systems like.
-        let (folder, name) = name.split_at(2);
-        self.root.join(map.folder()).join(folder).join(name)
+        let (part, name) = name.split_at(2);
+        self.root.join(folder).join(part).join(name)
     }
 
     /// The action of a key; `None` where there is none.
@@ -213,7 +224,7 @@ impl Store {
         }
         file.as_file().sync_all()?;
         // Others may share the store.
-        crate::pack::make_readable(file.as_file())?;
+        crate::aside::make_readable(file.as_file())?;
         file.persist(path).map(drop).map_err(|e| e.error)
     }
 }

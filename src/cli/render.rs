@@ -149,7 +149,7 @@ fn write(args: &RenderArgs, pictures: &[Vec<u8>], fps: f32) -> Result<()> {
 
 /// Moves a finished file to its place, readable by all as other outputs are.
 pub fn persist(file: tempfile::NamedTempFile<File>, path: &Path) -> Result<()> {
-    crate::pack::make_readable(file.as_file()).map_err(Error::io(path))?;
+    crate::aside::make_readable(file.as_file()).map_err(Error::io(path))?;
     file.persist(path).map(drop).map_err(|e| Error::io(path)(e.error))
 }
 

@@ -50,8 +50,6 @@ struct Asset {
 struct Quiet(Vec<String>);
 
 impl Progress for Quiet {
-    fn stage(&mut self, _: &'static str, _: u64, _: &'static str) {}
-    fn advance(&mut self, _: u64) {}
     fn warn(&mut self, warning: &str) {
         self.0.push(warning.to_owned());
     }

@@ -20,5 +20,4 @@ pub use error::PackError;
 pub use provenance::{Provenance, Source};
 pub use reader::{Frame, Grid, Pack};
 pub use repack::repack;
-pub(crate) use writer::make_readable;
 pub use writer::{FinishedPack, PackWriter, SectionSpec, compress_chunk};

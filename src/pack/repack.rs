@@ -1,5 +1,6 @@
 //! The same pack at another level of zstd.
 
+use std::io;
 use std::path::Path;
 
 use rayon::prelude::*;
@@ -47,7 +48,7 @@ pub fn repack(
         writer.begin()?;
         let chunks: Vec<usize> = chunk_range(section).collect();
         for chunks in chunks.chunks(CHUNKS_IN_FLIGHT) {
-            crate::interrupt::check()?;
+            crate::interrupt::check().map_err(io::Error::from)?;
             let packed: Vec<_> = chunks
                 .par_iter()
                 .map(|&chunk| {

@@ -3,9 +3,10 @@
 use std::fs::File;
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use tempfile::NamedTempFile;
+
+use crate::aside::{LEFT_BEHIND, is_temporary, make_readable};
 
 use super::layout::{ALIGNMENT, Chunk, Header, MAGIC, Section, VERSION, encoding};
 
@@ -210,23 +211,13 @@ fn beside(path: &Path) -> io::Result<NamedTempFile> {
 
 /// What the names of unfinished packs begin with.
 const PREFIX: &str = ".volpack-";
-/// A pack that was being written this long ago was left by a process that was killed.
-const LEFT_BEHIND: Duration = Duration::from_secs(24 * 3600);
-
 fn remove_left_behind(folder: &Path) {
     let is_old = |entry: &std::fs::DirEntry| {
         let modified = entry.metadata().and_then(|m| m.modified()).ok();
         modified.and_then(|m| m.elapsed().ok()).is_some_and(|age| age > LEFT_BEHIND)
     };
     let entries = std::fs::read_dir(folder).into_iter().flatten().flatten();
-    let is_ours = |entry: &std::fs::DirEntry| {
-        let name = entry.file_name().to_string_lossy().into_owned();
-        // What `tempfile` puts behind a prefix.
-        let is_random = |rest: &str| rest.len() == 6 && rest.chars().all(|c| c.is_ascii_alphanumeric());
-        name.strip_prefix(PREFIX).is_some_and(is_random)
-    };
-    let ours = entries.filter(is_ours);
-    for entry in ours.filter(is_old) {
+    for entry in entries.filter(|entry| is_temporary(&entry.path(), PREFIX) && is_old(entry)) {
         // Tidying up must not keep anyone from building.
         let _ = std::fs::remove_file(entry.path());
     }
@@ -275,15 +266,4 @@ pub(super) fn tables_digest(header: &Header, sections: &[Section], chunks: &[Chu
     hasher.update(bytemuck::cast_slice(sections));
     hasher.update(bytemuck::cast_slice(chunks));
     *hasher.finalize().as_bytes()
-}
-
-/// Temporary files are made for their owner alone; a pack is for everyone, as any other output.
-pub(crate) fn make_readable(file: &File) -> io::Result<()> {
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::PermissionsExt;
-        file.set_permissions(std::fs::Permissions::from_mode(0o644))?;
-    }
-    let _ = file;
-    Ok(())
 }

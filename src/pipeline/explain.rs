@@ -6,7 +6,7 @@ use serde_json::Value as Json;
 use super::reuse::Reuse;
 use super::{Job, Plan, Silent, frames, plan};
 use crate::error::Result;
-use crate::pack::{Pack, Provenance};
+use crate::pack::{Pack, Provenance, Source};
 
 /// What a build would do.
 #[derive(Clone, Debug, Default, Serialize)]
@@ -39,7 +39,8 @@ pub fn explain(job: &Job) -> Result<Explanation> {
         Some(reuse) => reuse.look(job),
         None => (false, false, false),
     };
-    if is_there && reuse.as_ref().is_some_and(|reuse| reuse.is_verified(job)) {
+    let is_verified = reuse.is_some_and(|reuse| reuse.is_verified(job));
+    if is_there && is_verified {
         return Ok(out);
     }
     if !has_pack && !has_other_level {
@@ -51,7 +52,7 @@ pub fn explain(job: &Job) -> Result<Explanation> {
         (.., true) => say("serialise", format!("packed anew at zstd {}, from the cache", job.settings.zstd)),
         _ => say("serialise", "all".to_owned()),
     }
-    if !reuse.is_some_and(|reuse| reuse.is_verified(job)) {
+    if !is_verified {
         say("verify", "voxels and pictures".to_owned());
     }
     Ok(out)
@@ -61,13 +62,8 @@ pub fn explain(job: &Job) -> Result<Explanation> {
 fn stages(job: &Job, plan: &Plan, say: &mut impl FnMut(&'static str, String)) {
     let all = plan.sequence.frames.len();
     let unknown = frames::unknown(&plan.sequence, &plan.selection, &job.settings, job.cache.as_deref());
-    let listed = match &unknown[..] {
-        [] => String::new(),
-        few if few.len() <= LISTED => format!(": {}", few.join(", ")),
-        many => format!(": {} and {} more", many[..LISTED].join(", "), many.len() - LISTED),
-    };
     if !unknown.is_empty() {
-        say("flatten", format!("{} of {all} frames{listed}", unknown.len()));
+        say("flatten", format!("{} of {all} frames: {}", unknown.len(), listed(&unknown)));
     }
     say("dedup", format!("{all} frames"));
     say("allocate", "all bricks, from what the cache knows of them".to_owned());
@@ -109,22 +105,26 @@ fn reasons(job: &Job, new: &Provenance) -> Vec<String> {
             }
         }
     }
-    let changed = |old: &Provenance, new: &Provenance, what: &str| {
-        let missing = |s: &&crate::pack::Source| !old.sources.iter().any(|o| o.file == s.file);
-        let files: Vec<&str> = new.sources.iter().filter(missing).map(|s| s.file.as_str()).collect();
-        (!files.is_empty()).then(|| named(&files, what))
+    let was = |file: &str| old.sources.iter().find(|source| source.file == file);
+    let files = |sources: &[Source], which: &dyn Fn(&Source) -> bool| -> Vec<String> {
+        sources.iter().filter(|source| which(source)).map(|source| source.file.clone()).collect()
     };
-    let differs =
-        |s: &&crate::pack::Source| old.sources.iter().any(|o| o.file == s.file && o.blake3 != s.blake3);
-    let files: Vec<&str> = new.sources.iter().filter(differs).map(|s| s.file.as_str()).collect();
-    reasons.extend((!files.is_empty()).then(|| named(&files, "changed")));
-    reasons.extend(changed(&old, new, "came"));
-    reasons.extend(changed(new, &old, "went"));
+    let differs = |s: &Source| was(&s.file).is_some_and(|o| o.blake3 != s.blake3);
+    let is_new = |s: &Source| was(&s.file).is_none();
+    let is_gone = |s: &Source| !new.sources.iter().any(|n| n.file == s.file);
+    for (files, what) in [
+        (files(&new.sources, &differs), "changed"),
+        (files(&new.sources, &is_new), "came"),
+        (files(&old.sources, &is_gone), "went"),
+    ] {
+        reasons.extend((!files.is_empty()).then(|| format!("{} {what}", listed(&files))));
+    }
     reasons
 }
 
-fn named(files: &[&str], what: &str) -> String {
+/// Names files, and counts those past the first few.
+fn listed(files: &[String]) -> String {
     let rest = files.len().saturating_sub(LISTED);
     let more = if rest > 0 { format!(" and {rest} more") } else { String::new() };
-    format!("{}{more} {what}", files[..files.len() - rest].join(", "))
+    format!("{}{more}", files[..files.len() - rest].join(", "))
 }

@@ -42,7 +42,7 @@ pub(super) fn read(
         grids.push(grid_input(sequence, grid, tree, settings));
     }
     for window in sequence.frames.chunks(rayon::current_num_threads()) {
-        crate::interrupt::check().map_err(scratch)?;
+        crate::interrupt::check()?;
         let read = |frame: &FrameSource| read_frame(frame, selection, settings, cache.map(|c| &**c), alter);
         let frames: Vec<_> = window.par_iter().map(read).collect();
         for (source, frame) in window.iter().zip(frames) {
@@ -72,6 +72,7 @@ fn read_frame(
     alter: Option<Alter>,
 ) -> Result<Vec<Option<Frame>>> {
     let mut file = None;
+    let mut read = Vec::new();
     let one = |grid: &SelectedGrid| -> Result<Option<Frame>> {
         let Some(key) = key(frame, grid, settings) else { return Ok(None) };
         let known = cache.and_then(|cache| cache.get::<Outline>(&key)).filter(Outline::is_sound);
@@ -87,13 +88,16 @@ fn read_frame(
             alter(&mut flat.frame);
         }
         let (outline, voxels) = Outline::split(flat, mask_policy(settings, grid.class));
-        if let Some(cache) = cache {
-            frame.check_unchanged()?;
-            cache.put(&key, &outline);
-        }
+        read.push(key);
         Ok(Some((outline, Some(voxels))))
     };
-    selection.grids.iter().map(one).collect()
+    let frames = selection.grids.iter().map(one).collect::<Result<Vec<_>>>()?;
+    if let Some(cache) = cache.filter(|_| !read.is_empty()) {
+        frame.check_unchanged()?;
+        let outlines = frames.iter().flatten().filter(|(_, voxels)| voxels.is_some());
+        read.iter().zip(outlines).for_each(|(key, (outline, _))| cache.put(key, outline));
+    }
+    Ok(frames)
 }
 
 fn flatten_grid(
@@ -116,13 +120,10 @@ fn fetch(sequence: &SequenceInfo, grid: &SelectedGrid, settings: &Settings) -> B
     let (grid, settings) = (grid.clone(), settings.clone());
     Box::new(move |place| {
         let frame = &frames[place];
-        let voxels = || {
-            let file = VdbFile::open(&frame.path).map_err(Error::vdb(&frame.path))?;
-            let flat = flatten_grid(&file, frame, &grid, &settings)?;
-            frame.check_unchanged()?;
-            Ok(flat.frame.bricks)
-        };
-        voxels().map_err(|e: Error| std::io::Error::other(e))
+        let file = VdbFile::open(&frame.path).map_err(Error::vdb(&frame.path))?;
+        let flat = flatten_grid(&file, frame, &grid, &settings)?;
+        frame.check_unchanged()?;
+        Ok(flat.frame.bricks)
     })
 }
 

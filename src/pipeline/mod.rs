@@ -69,24 +69,20 @@ impl Job {
     }
 }
 
-/// Hears how a build is getting on. Called from one thread at a time.
+/// Hears how a build is getting on, of what it cares for. Called from one thread at a time.
 pub trait Progress {
     /// A stage begins, which has that many steps of that kind.
-    fn stage(&mut self, name: &'static str, steps: u64, unit: &'static str);
+    fn stage(&mut self, _name: &'static str, _steps: u64, _unit: &'static str) {}
     /// That many more steps of the stage are done.
-    fn advance(&mut self, steps: u64);
+    fn advance(&mut self, _steps: u64) {}
     /// Something is odd but does not stop the build.
-    fn warn(&mut self, warning: &str);
+    fn warn(&mut self, _warning: &str) {}
 }
 
 /// Progress that nobody hears of.
 pub struct Silent;
 
-impl Progress for Silent {
-    fn stage(&mut self, _: &'static str, _: u64, _: &'static str) {}
-    fn advance(&mut self, _: u64) {}
-    fn warn(&mut self, _: &str) {}
-}
+impl Progress for Silent {}
 
 /// What a build did.
 pub struct Outcome {

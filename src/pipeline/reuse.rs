@@ -65,7 +65,7 @@ impl<'a> Reuse<'a> {
             Reused::Nothing => self.repack(job, provenance)?,
             found => found,
         };
-        self.cache.count_file(&self.exact, !matches!(found, Reused::Nothing));
+        self.cache.count(&self.exact, !matches!(found, Reused::Nothing));
         Ok(found)
     }
 

@@ -85,7 +85,7 @@ pub fn quantise<T: Send>(
     let atlas = &planned.atlas;
     let group = (BRICKS_IN_FLIGHT / atlas.slab_bricks()).max(1);
     for first in (0..atlas.slabs).step_by(group as usize) {
-        crate::interrupt::check()?;
+        crate::interrupt::check().map_err(io::Error::from)?;
         let slabs: Vec<&[Texture]> = (first..(first + group).min(atlas.slabs))
             .map(|slab| atlas.slots(slab))
             .map(|slots| &planned.texels[slots.start as usize..slots.end as usize])

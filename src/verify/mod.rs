@@ -59,7 +59,7 @@ pub fn voxels(pack: &Pack, sources: &Sources, mut advance: impl FnMut(u64)) -> R
     let places: Vec<usize> = (0..paths.len()).collect();
     // As many frames in memory as there are threads.
     for window in places.chunks(rayon::current_num_threads()) {
-        crate::interrupt::check().map_err(Error::io(""))?;
+        crate::interrupt::check()?;
         let results: Vec<_> =
             window.par_iter().map(|&source| compare_source(pack, source, &paths[source])).collect();
         for result in results {

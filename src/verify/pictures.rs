@@ -126,7 +126,7 @@ pub fn pictures(pack: &Pack, sources: &Sources, settings: &PictureSettings) -> R
     }
     for (g, grid) in pack.grids.iter().enumerate() {
         for f in shown_frames(grid.frames.len()) {
-            crate::interrupt::check().map_err(Error::io(""))?;
+            crate::interrupt::check()?;
             let picture = compare(pack, sources, &renderer, [g, f], settings)?;
             let Some(picture) = picture else { continue };
             let what = format!("grid {:?} frame {}", grid.name, picture.frame);

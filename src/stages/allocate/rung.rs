@@ -46,9 +46,9 @@ impl Rung {
     /// What it does to a brick that borrows nothing; `None` while it has not been tried.
     pub fn cost(self, encodings: &Encodings, brick: u32) -> Option<Cost> {
         match self {
-            Self::Empty => Some(encodings.plain(brick).empty),
-            Self::Constant => Some(encodings.plain(brick).constant),
-            Self::F16 => Some(encodings.plain(brick).f16),
+            Self::Empty => encodings.plain(brick).map(|plain| plain.empty),
+            Self::Constant => encodings.plain(brick).map(|plain| plain.constant),
+            Self::F16 => encodings.plain(brick).map(|plain| plain.f16),
             Self::F32 => Some(Cost::NONE),
             Self::Borrowed => Some(Cost::IMPOSSIBLE),
             Self::Bc7 => encodings.cost(brick, KeptCodec::Bc7),

@@ -446,7 +446,10 @@ impl<'a> GridSearch<'a> {
             allocation.norms[brick] = costs[brick];
             allocation.codings[brick] = match rung {
                 Rung::Empty => Coding::Empty,
-                Rung::Constant => Coding::Constant(allocation.encodings.plain(brick as u32).value),
+                Rung::Constant => {
+                    let plain = allocation.encodings.plain(brick as u32);
+                    Coding::Constant(plain.expect("what was picked was tried").value)
+                }
                 Rung::Borrowed => continue,
                 rung => Coding::Own(rung.codec()),
             };

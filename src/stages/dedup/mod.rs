@@ -207,7 +207,7 @@ impl SequenceTree {
         let is_told =
             |id: u32| voxels.get(pool.home(id).brick as usize).is_some_and(|b| pool.is_digest_of(id, b));
         if !own.into_par_iter().all(is_told) {
-            return Err(io::Error::other(Error::Misled("the outline of a frame is not its own".to_owned())));
+            return Err(Error::Misled("the outline of a frame is not its own".to_owned()).into());
         }
         self.put_voxels(frame, voxels)
     }

@@ -97,12 +97,6 @@ impl Kind {
     ];
 }
 
-impl Batch {
-    fn key(&self, kind: Kind) -> Option<Key> {
-        self.base.map(|base| Key::new(&STAGE, &(base.digest(), kind)))
-    }
-}
-
 /// What the cache has of a batch.
 struct Found {
     kind: Kind,
@@ -113,6 +107,10 @@ struct Found {
 }
 
 impl Batch {
+    fn key(&self, kind: Kind) -> Option<Key> {
+        self.base.map(|base| Key::new(&STAGE, &(base.digest(), kind)))
+    }
+
     fn find(&self, tree: &SequenceTree, cache: &Cache, kind: Kind) -> Option<Found> {
         let all = cache.get::<Entry>(&self.key(kind)?).filter(|entry| entry.is_sound(kind))?;
         let (mut ids, mut places) = (Vec::new(), Vec::new());
@@ -191,21 +189,15 @@ impl Entry {
 
     /// What is in either; of what is in both, this one's.
     fn union(self, other: &Self, kind: Kind) -> Self {
-        let size = kind.size();
-        let mut all = Self::default();
-        let (mut i, mut j) = (0, 0);
-        while i < self.places.len() || j < other.places.len() {
-            let (a, b) = (self.places.get(i), other.places.get(j));
-            if a.is_some_and(|a| b.is_none_or(|b| a <= b)) {
-                j += usize::from(a == b);
-                all.push_from(&self, i, size);
-                i += 1;
-            } else {
-                all.push_from(other, j, size);
-                j += 1;
-            }
-        }
-        all
+        let of = |entry| move |(i, &place): (usize, &u32)| (place, entry, i);
+        let (own, others) = (self.places.iter().enumerate(), other.places.iter().enumerate());
+        let mut all: Vec<(u32, &Self, usize)> = own.map(of(&self)).chain(others.map(of(other))).collect();
+        // Stable: of two for one place, this one's is the first.
+        all.sort_by_key(|(place, ..)| *place);
+        all.dedup_by_key(|(place, ..)| *place);
+        let mut union = Self::default();
+        all.into_iter().for_each(|(_, entry, i)| union.push_from(entry, i, kind.size()));
+        union
     }
 }
 
@@ -283,7 +275,7 @@ impl Encodings {
             ..Entry::default()
         };
         match kind {
-            Kind::Plain => entry.plain = ids.iter().map(|&id| *self.plain(id)).collect(),
+            Kind::Plain => entry.plain = ids.iter().filter_map(|&id| self.plain(id).copied()).collect(),
             Kind::Texels(codec) => {
                 entry.costs = ids.iter().filter_map(|&id| self.cost(id, codec)).collect();
                 for (bytes, axis) in self.texels(ids, codec)? {

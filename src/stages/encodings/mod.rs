@@ -39,11 +39,6 @@ impl Cost {
     pub const NONE: Self = Self { norm: 0.0, active_norm: 0.0, max: 0.0 };
     /// More error than any.
     pub const IMPOSSIBLE: Self = Self { norm: f64::INFINITY, active_norm: f64::INFINITY, max: f32::INFINITY };
-    const UNKNOWN: Self = Self { norm: f64::NAN, active_norm: f64::NAN, max: f32::NAN };
-
-    fn is_known(&self) -> bool {
-        !self.norm.is_nan()
-    }
 }
 
 /// What a constant brick's value keeps small.
@@ -66,11 +61,6 @@ pub struct Plain {
     pub empty: Cost,
     /// As half floats.
     pub f16: Cost,
-}
-
-impl Plain {
-    const UNKNOWN: Self =
-        Self { value: f32::NAN, constant: Cost::UNKNOWN, empty: Cost::UNKNOWN, f16: Cost::UNKNOWN };
 }
 
 /// What is made of bricks and kept.
@@ -137,7 +127,7 @@ pub struct Encodings {
     pub ranges: Vec<BrickRange>,
     terms: Terms,
     rules: Vec<InactiveRule>,
-    plain: Vec<Plain>,
+    plain: Vec<Option<Plain>>,
     kept: [KeptTexels; KeptCodec::ALL.len()],
     batches: Batches,
     saved: Instant,
@@ -158,7 +148,7 @@ impl Encodings {
         let batches = Batches::new(tree, cache, &sequence, &terms);
         Some(Self {
             rules: tree.brick_rules(),
-            plain: Vec::new(),
+            plain: vec![None; ranges.len()],
             kept: KeptCodec::ALL.map(|codec| KeptTexels::new(codec.codec())),
             batches,
             saved: Instant::now(),
@@ -168,9 +158,9 @@ impl Encodings {
         })
     }
 
-    /// What is known of a brick without texels; unknown costs are not numbers.
-    pub fn plain(&self, id: u32) -> &Plain {
-        self.plain.get(id as usize).unwrap_or(&Plain::UNKNOWN)
+    /// What a brick would be without texels; `None` while it has not been tried.
+    pub fn plain(&self, id: u32) -> Option<&Plain> {
+        self.plain[id as usize].as_ref()
     }
 
     /// What a codec does to a brick; `None` while it has not been tried.
@@ -204,7 +194,7 @@ impl Encodings {
 
     fn is_known(&self, id: u32, kind: Kind) -> bool {
         match kind {
-            Kind::Plain => self.plain(id).constant.is_known(),
+            Kind::Plain => self.plain(id).is_some(),
             Kind::Texels(codec) => self.cost(id, codec).is_some(),
         }
     }
@@ -313,8 +303,7 @@ impl Encodings {
     }
 
     fn keep_plain(&mut self, ids: &[u32], plain: &[Plain]) {
-        self.plain.resize(self.rules.len(), Plain::UNKNOWN);
-        ids.iter().zip(plain).for_each(|(&id, plain)| self.plain[id as usize] = *plain);
+        ids.iter().zip(plain).for_each(|(&id, plain)| self.plain[id as usize] = Some(*plain));
     }
 }
 
