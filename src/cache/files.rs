@@ -5,7 +5,7 @@ use std::io::{self, Read, Write};
 use std::path::Path;
 
 use super::writer::Content;
-use super::{Blob, Cache, Key};
+use super::{Blob, Cache, Key, Map, tiers};
 
 /// Bytes that are copied and hashed at a time: enough for BLAKE3 to use its widest lanes.
 const PIECE: usize = 1 << 20;
@@ -17,6 +17,9 @@ impl Cache {
     /// # Errors
     /// When the file cannot be opened.
     pub fn put_file(&self, key: &Key, path: &Path, blob: Blob) -> io::Result<()> {
+        self.upload(key, Map::Blobs, blob.digest, || {
+            tiers::may_travel(&blob).then(|| std::fs::read(path).ok())?
+        });
         self.keep(key, blob, Content::File(File::open(path)?));
         Ok(())
     }
@@ -26,7 +29,10 @@ impl Cache {
     /// # Errors
     /// When `to` cannot be written: that is no matter of the cache.
     pub fn get_file(&self, blob: &Blob, to: &mut File) -> io::Result<bool> {
-        let Some(mut from) = self.store.open_blob(blob) else { return Ok(false) };
+        let Some(mut from) = self.store.open_blob(blob) else {
+            let fetched = self.fetch_blob(blob);
+            return fetched.map_or(Ok(false), |bytes| to.write_all(&bytes).map(|()| true));
+        };
         let (mut hasher, mut piece) = (blake3::Hasher::new(), vec![0; PIECE]);
         loop {
             let read = match from.read(&mut piece) {

@@ -11,6 +11,8 @@ pub struct Stage {
     pub name: &'static str,
     /// To be raised whenever the same inputs give another result, or the result another layout.
     pub version: u32,
+    /// Whether its results go to a remote too.
+    pub travels: bool,
 }
 
 /// BLAKE3 of a stage, its version and everything that its result depends on: no paths and no times.
@@ -18,6 +20,7 @@ pub struct Stage {
 pub struct Key {
     stage: &'static str,
     digest: [u8; 32],
+    travels: bool,
 }
 
 impl Key {
@@ -28,7 +31,12 @@ impl Key {
             hasher.update(&(part.len() as u64).to_le_bytes()).update(part.as_bytes());
         }
         hasher.update(&stage.version.to_le_bytes()).update(&artefact::encode(inputs));
-        Self { stage: stage.name, digest: hasher.finalize().into() }
+        Self { stage: stage.name, digest: hasher.finalize().into(), travels: stage.travels }
+    }
+
+    /// Whether the result goes to a remote too.
+    pub(super) fn travels(&self) -> bool {
+        self.travels
     }
 
     /// The stage's name.

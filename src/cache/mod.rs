@@ -6,17 +6,22 @@
 //! can forge an entry with right digests, and is trusted. Both are written aside, synced and renamed, so any number of
 //! processes may share one store without locks.
 //!
+//! Behind the store may be a remote with the same two maps, which machines share. What the store lacks is looked up there
+//! and kept; what is made goes to both.
+//!
 //! A cache never fails a build. What goes wrong is a warning.
 
 mod artefact;
 mod files;
 mod key;
 mod maintain;
+pub mod remote;
 mod stamps;
 mod store;
+mod tiers;
 mod writer;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, HashSet};
 use std::io;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -28,6 +33,7 @@ pub use key::{Key, Stage};
 pub use maintain::{Damage, Stats};
 pub use stamps::Stamp;
 
+use remote::Remote;
 use store::{Entry, Map, Store};
 use writer::{Content, Writer};
 
@@ -35,6 +41,9 @@ use writer::{Content, Writer};
 pub struct Cache {
     store: Store,
     writer: Writer,
+    remote: Option<Remote>,
+    /// What the remote was found to lack, so that it is asked once a build.
+    absent: Mutex<HashSet<(Map, [u8; 32])>>,
     uses: Mutex<BTreeMap<&'static str, Uses>>,
     warnings: Mutex<Vec<String>>,
 }
@@ -65,7 +74,14 @@ impl Cache {
     pub fn open(folder: &Path) -> io::Result<Self> {
         let store = Store::open(folder)?;
         let writer = Writer::new(store.clone());
-        Ok(Self { store, writer, uses: Mutex::default(), warnings: Mutex::default() })
+        Ok(Self {
+            store,
+            writer,
+            remote: None,
+            absent: Mutex::default(),
+            uses: Mutex::default(),
+            warnings: Mutex::default(),
+        })
     }
 
     /// The platform's folder for caches, with ours in it; `None` where the platform names none.
@@ -88,7 +104,9 @@ impl Cache {
     /// The same for who asks not for its own sake: it counts as no use.
     pub fn peek<T: DeserializeOwned>(&self, key: &Key) -> Option<T> {
         self.blob(key).and_then(|blob| {
-            let bytes = self.checked(self.store.read_blob(&blob))?;
+            let bytes = self
+                .checked(self.store.read_blob(&blob))
+                .or_else(|| key.travels().then(|| self.fetch_blob(&blob))?)?;
             let value = artefact::decode(&bytes);
             if value.is_none() {
                 self.warn(format!("an entry of {} is of another version: it is made anew", key.stage()));
@@ -101,12 +119,14 @@ impl Cache {
     pub fn put<T: Serialize>(&self, key: &Key, value: &T) {
         let bytes = artefact::encode(value);
         let blob = Blob { digest: blake3::hash(&bytes).into(), bytes: bytes.len() as u64 };
+        self.upload(key, Map::Blobs, blob.digest, || Some(bytes.clone()));
         self.keep(key, blob, Content::Bytes(bytes));
     }
 
     /// Lets a key stand for a result that is kept under another already.
     pub fn put_alias(&self, key: &Key, blob: Blob) {
         let entry = Entry::new(key, blob).to_bytes();
+        self.upload(key, Map::Actions, *key.digest(), || Some(entry.clone()));
         self.writer.write(Map::Actions, *key.digest(), Content::Bytes(entry));
     }
 
@@ -117,21 +137,27 @@ impl Cache {
 
     /// The digest and length of what a stage gave, without reading it.
     pub fn blob(&self, key: &Key) -> Option<Blob> {
-        self.checked(self.store.read_action(key)).map(|entry| entry.blob)
+        let entry = self.checked(self.store.read_action(key)).or_else(|| self.fetch_action(key));
+        entry.map(|entry| entry.blob)
     }
 
-    /// Whether a stage's result is there and as long as it should be. Not its digest: for looking ahead.
+    /// Whether a stage's result is in the store and as long as it should be. Not its digest: for looking ahead.
     pub fn has(&self, key: &Key) -> bool {
         matches!(self.store.read_action(key), Ok(Some(entry)) if self.store.has_blob(&entry.blob))
     }
 
-    /// Writes what is on its way, and gives what is to be told since the last time.
+    /// Writes what is on its way to the disk, and gives what is to be told since the last time.
     pub fn flush(&self) -> Vec<String> {
         let failed = self.writer.flush();
+        lock(&self.absent).clear();
         let mut warnings = std::mem::take(&mut *lock(&self.warnings));
+        warnings.extend(self.remote.iter().flat_map(Remote::warnings));
+        warnings.extend(failed.map(|e| self.cannot_be_written(&e)));
         warnings
-            .extend(failed.map(|e| format!("the cache {} cannot be written: {e}", self.folder().display())));
-        warnings
+    }
+
+    fn cannot_be_written(&self, error: &io::Error) -> String {
+        format!("the cache {} cannot be written: {error}", self.folder().display())
     }
 
     /// How often each stage's results were asked for since the last time.

@@ -6,20 +6,22 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use super::artefact;
-use super::writer::Content;
 use super::{Blob, Key};
 
 /// Which of the maps.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Map {
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Map {
+    /// From a key to the digest of a result. A later entry replaces an earlier one.
     Actions,
+    /// From a digest to the bytes that it names.
     Blobs,
 }
 
 impl Map {
-    pub const ALL: [Self; 2] = [Self::Actions, Self::Blobs];
+    pub(super) const ALL: [Self; 2] = [Self::Actions, Self::Blobs];
 
-    pub fn folder(self) -> &'static str {
+    /// The folder of its entries, in a store and in a bucket.
+    pub(super) fn folder(self) -> &'static str {
         match self {
             Self::Actions => "actions",
             Self::Blobs => "blobs",
@@ -44,7 +46,7 @@ const MAGIC: [u8; 8] = *b"vpcache\x01";
 /// Letters of a stage's name in an action.
 const NAME_BYTES: usize = 16;
 /// Magic, stage, digest, length, and BLAKE3 of those.
-const ACTION_BYTES: usize = 8 + NAME_BYTES + 32 + 8 + 32;
+pub(super) const ACTION_BYTES: usize = 8 + NAME_BYTES + 32 + 8 + 32;
 
 /// What stands in an action.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -69,6 +71,13 @@ impl Entry {
         seal([&MAGIC[..], &self.stage, &self.blob.digest, &self.blob.bytes.to_le_bytes()].concat())
     }
 
+    /// The entry of a key.
+    pub fn of(key: &Key, bytes: &[u8]) -> Result<Self, &'static str> {
+        let entry = Self::from_bytes(bytes)?;
+        let is_ours = entry.stage == Self::new(key, entry.blob).stage;
+        if is_ours { Ok(entry) } else { Err("it is another stage's") }
+    }
+
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, &'static str> {
         let mut body = unseal(bytes)?;
         let mut take = |buffer: &mut [u8]| body.read_exact(buffer).map_err(|_| "it is cut short");
@@ -84,6 +93,17 @@ impl Entry {
     }
 }
 
+impl Blob {
+    /// Whether bytes are the blob's.
+    pub(super) fn check(&self, bytes: &[u8]) -> Result<(), &'static str> {
+        let is_whole = bytes.len() as u64 == self.bytes && blake3::hash(bytes) == self.digest;
+        if is_whole { Ok(()) } else { Err(NOT_ITS_DIGEST) }
+    }
+}
+
+/// What is wrong with most damaged entries.
+const NOT_ITS_DIGEST: &str = "its digest is not that of its bytes";
+
 /// Bytes with their BLAKE3 behind them.
 pub(super) fn seal(mut bytes: Vec<u8>) -> Vec<u8> {
     bytes.extend(blake3::hash(&bytes).as_bytes());
@@ -93,7 +113,7 @@ pub(super) fn seal(mut bytes: Vec<u8>) -> Vec<u8> {
 /// The inverse of [`seal`].
 pub(super) fn unseal(bytes: &[u8]) -> Result<&[u8], &'static str> {
     let (body, digest) = bytes.split_last_chunk::<32>().ok_or("it is cut short")?;
-    if blake3::hash(body) == *digest { Ok(body) } else { Err("its digest is not that of its bytes") }
+    if blake3::hash(body) == *digest { Ok(body) } else { Err(NOT_ITS_DIGEST) }
 }
 
 /// An entry that cannot be used.
@@ -139,11 +159,7 @@ impl Store {
     /// The action of a key; `None` where there is none.
     pub fn read_action(&self, key: &Key) -> Result<Option<Entry>, Unusable> {
         let path = self.path(Map::Actions, key.digest());
-        self.read(&path, ACTION_BYTES as u64, |bytes| {
-            let entry = Entry::from_bytes(&bytes)?;
-            let is_ours = entry.stage == Entry::new(key, entry.blob).stage;
-            if is_ours { Ok(entry) } else { Err("it is another stage's") }
-        })
+        self.read(&path, ACTION_BYTES as u64, |bytes| Entry::of(key, &bytes))
     }
 
     /// A blob's bytes; `None` where they are not there.
@@ -152,10 +168,7 @@ impl Store {
         if blob.bytes > artefact::MOST as u64 {
             return Err(Unusable { path, why: format!("{} bytes are more than a result has", blob.bytes) });
         }
-        self.read(&path, blob.bytes, |bytes| match blake3::hash(&bytes) == blob.digest {
-            true => Ok(bytes),
-            false => Err("its digest is not that of its bytes"),
-        })
+        self.read(&path, blob.bytes, |bytes| blob.check(&bytes).map(|()| bytes))
     }
 
     pub fn has_blob(&self, blob: &Blob) -> bool {
@@ -202,26 +215,34 @@ impl Store {
     pub fn discard(&self, blob: &Blob) -> Unusable {
         let path = self.path(Map::Blobs, &blob.digest);
         let _ = fs::remove_file(&path);
-        Unusable { path, why: "its digest is not that of its bytes".to_owned() }
+        Unusable { path, why: NOT_ITS_DIGEST.to_owned() }
     }
 
     /// Puts an entry in its place, in one step.
-    pub fn write(&self, map: Map, digest: &[u8; 32], content: Content) -> io::Result<()> {
+    pub fn write(&self, map: Map, digest: &[u8; 32], bytes: &[u8]) -> io::Result<()> {
+        self.write_with(map, digest, bytes.len() as u64, |file| file.write_all(bytes))
+    }
+
+    /// The same with what is in a file.
+    pub fn write_file(&self, map: Map, digest: &[u8; 32], mut from: File) -> io::Result<()> {
+        self.write_with(map, digest, from.metadata()?.len(), |file| io::copy(&mut from, file).map(drop))
+    }
+
+    fn write_with(
+        &self,
+        map: Map,
+        digest: &[u8; 32],
+        bytes: u64,
+        fill: impl FnOnce(&mut File) -> io::Result<()>,
+    ) -> io::Result<()> {
         let path = self.path(map, digest);
-        let bytes = match &content {
-            Content::Bytes(bytes) => bytes.len() as u64,
-            Content::File(file) => file.metadata()?.len(),
-        };
         // A blob is what its name says, or it is found out and removed when it is read.
         if map == Map::Blobs && fs::metadata(&path).is_ok_and(|m| m.len() == bytes) {
             return Ok(());
         }
         fs::create_dir_all(path.parent().unwrap_or(&self.root))?;
         let mut file = tempfile::NamedTempFile::new_in(self.root.join(ASIDE))?;
-        match content {
-            Content::Bytes(bytes) => file.write_all(&bytes)?,
-            Content::File(mut from) => io::copy(&mut from, file.as_file_mut()).map(drop)?,
-        }
+        fill(file.as_file_mut())?;
         file.as_file().sync_all()?;
         // Others may share the store.
         crate::aside::make_readable(file.as_file())?;

@@ -88,7 +88,11 @@ impl Drop for Writer {
 
 impl Waiting {
     fn write(self, store: &Store, failed: &Mutex<Option<io::Error>>) {
-        if let Err(e) = store.write(self.map, &self.digest, self.content) {
+        let written = match self.content {
+            Content::Bytes(bytes) => store.write(self.map, &self.digest, &bytes),
+            Content::File(file) => store.write_file(self.map, &self.digest, file),
+        };
+        if let Err(e) = written {
             lock(failed).get_or_insert(e);
         }
     }

@@ -22,7 +22,7 @@ pub struct BuildArgs {
 pub fn run(args: &BuildArgs, common: Common) -> Result<()> {
     let mut assets = Vec::new();
     let mut failure = None;
-    let cache = args.jobs.cache.open();
+    let cache = args.jobs.open_cache();
     for (name, job) in args.jobs.jobs(cache.as_ref(), VerifyLevel::All)? {
         if matches!(failure, Some(Error::Interrupted)) {
             break;
@@ -35,6 +35,9 @@ pub fn run(args: &BuildArgs, common: Common) -> Result<()> {
             failure.replace(error).iter().for_each(super::print_error);
         }
         assets.push(asset);
+    }
+    if let Some(cache) = cache.filter(|_| !matches!(failure, Some(Error::Interrupted))) {
+        super::cache::finish(&cache, common.quiet || args.json);
     }
     if args.json {
         print_json(&json!({ "assets": assets }));

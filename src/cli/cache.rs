@@ -7,10 +7,13 @@ use std::time::Duration;
 use clap::{Args, Subcommand};
 use serde_json::json;
 
+use super::progress::Reporter;
 use super::style::{GOOD, TITLE, WARNING, bytes, count};
 use super::{Common, outln, print_json};
 use crate::cache::Cache;
+use crate::cache::remote::{Policy, Remote};
 use crate::error::{Error, Result};
+use crate::pipeline::Progress;
 use crate::settings::ByteSize;
 
 /// Where what builds make is kept.
@@ -19,6 +22,23 @@ pub struct CacheArgs {
     /// Where what was made is kept for the next build [default: the platform's folder for caches]
     #[arg(long = "cache", value_name = "DIR", env = "VOLPACK_CACHE", hide_env_values = true, global = true)]
     folder: Option<PathBuf>,
+}
+
+/// A cache behind it that machines share.
+#[derive(Args, Clone)]
+pub struct RemoteArgs {
+    /// A bucket behind it that machines share: s3://bucket/prefix, gs://bucket/prefix, az://container/prefix, with
+    /// credentials and options from AWS_*, GOOGLE_* or AZURE_* in the environment
+    #[arg(long = "remote-cache", value_name = "URL", env = "VOLPACK_REMOTE_CACHE", hide_env_values = true)]
+    url: Option<String>,
+    /// Whether what is made is uploaded as well
+    #[arg(
+        long = "remote-policy",
+        value_name = "POLICY",
+        env = "VOLPACK_REMOTE_POLICY",
+        default_value = "read-write"
+    )]
+    policy: Policy,
 }
 
 /// The same for commands that can do without.
@@ -45,18 +65,51 @@ impl CacheArgs {
 impl CacheChoice {
     /// The cache; `None` where none is wanted, or none can be had: that is a warning, and a slower build.
     pub fn open(&self) -> Option<Arc<Cache>> {
+        self.open_store().map(Arc::new)
+    }
+
+    /// The same, with a remote if there is to be one.
+    pub fn open_with(&self, remote: &RemoteArgs) -> Option<Arc<Cache>> {
+        let cache = self.open_store()?;
+        let opened = remote.url.as_deref().map(|url| Remote::open(url, remote.policy)).transpose();
+        let remote = opened.unwrap_or_else(|error| {
+            warn(&format!("going on without a remote cache: {error}"));
+            None
+        });
+        Some(Arc::new(match remote {
+            Some(remote) => cache.with_remote(remote),
+            None => cache,
+        }))
+    }
+
+    fn open_store(&self) -> Option<Cache> {
         if self.no_cache {
             return None;
         }
         let opened = self.place.folder().and_then(|f| Cache::open(&f).map_err(Error::io(f)));
-        match opened {
-            Ok(cache) => Some(Arc::new(cache)),
-            Err(error) => {
-                anstream::eprintln!("{WARNING}warning{WARNING:#}: going on without a cache: {error}");
-                None
-            }
-        }
+        opened.inspect_err(|error| warn(&format!("going on without a cache: {error}"))).ok()
     }
+}
+
+fn warn(warning: &str) {
+    anstream::eprintln!("{WARNING}warning{WARNING:#}: {warning}");
+}
+
+/// Waits for what is on its way to a remote.
+pub fn finish(cache: &Cache, quiet: bool) {
+    let mut reporter = Reporter::new("cache", quiet);
+    let all = cache.waiting();
+    if all > 0 {
+        reporter.stage("upload", all, "entries");
+    }
+    let mut sent = 0;
+    let warnings = cache.finish(|left| {
+        let now = all.saturating_sub(left);
+        reporter.advance(now.saturating_sub(sent));
+        sent = now.max(sent);
+    });
+    warnings.iter().for_each(|warning| reporter.warn(warning));
+    reporter.finish();
 }
 
 #[derive(Args)]

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use clap::Args;
 
-use super::cache::CacheChoice;
+use super::cache::{CacheChoice, RemoteArgs};
 use super::{SettingsArgs, VerifyArg};
 use crate::cache::Cache;
 use crate::error::{Error, Result};
@@ -35,10 +35,17 @@ pub struct JobArgs {
     #[arg(long)]
     strict: bool,
     #[command(flatten)]
-    pub cache: CacheChoice,
+    cache: CacheChoice,
+    #[command(flatten)]
+    remote: RemoteArgs,
 }
 
 impl JobArgs {
+    /// The cache that is asked for.
+    pub fn open_cache(&self) -> Option<Arc<Cache>> {
+        self.cache.open_with(&self.remote)
+    }
+
     /// The packs that are asked for, with the names to show, checked as `verify` says where nothing is said.
     /// One whose files cannot be found is an error of its own.
     pub fn jobs(

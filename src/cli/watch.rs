@@ -56,7 +56,7 @@ impl Progress for Quiet {
 }
 
 pub fn run(args: &WatchArgs, common: Common) -> Result<()> {
-    let cache = args.jobs.cache.open();
+    let cache = args.jobs.open_cache();
     let settle = Duration::from_secs_f64(args.settle);
     let mut assets: BTreeMap<String, Asset> = BTreeMap::new();
     let mut trouble = None;

@@ -24,7 +24,7 @@ use crate::stages::dedup::SequenceTree;
 use crate::stages::encodings::{Batch, Cost, Encodings, KeptCodec, active};
 use crate::volume::{BRICK_VOXELS, Brick, Mask512};
 
-const STAGE: Stage = Stage { name: "share", version: 1 };
+const STAGE: Stage = Stage { name: "share", version: 1, travels: true };
 
 /// Bricks to either side that a batch is compared with at least: in short frames those of a few.
 const LEAST_NEAR: usize = 128;
@@ -84,6 +84,9 @@ pub(super) fn loans(
             Comparison { batch, borrowers, lenders: lenders_of[around.clone()].concat(), around }
         })
         .collect();
+    if let Some(cache) = encodings.cache() {
+        cache.prefetch(comparisons.iter().filter_map(|comparison| comparison.key(encodings, tree)));
+    }
     let known: Vec<(Option<Key>, Option<Offers>)> =
         comparisons.par_iter().map(|comparison| comparison.known(encodings, tree)).collect();
 

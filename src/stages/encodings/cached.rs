@@ -20,8 +20,8 @@ use crate::stages::dedup::SequenceTree;
 /// Bricks of a batch: with 512 bytes of texels each, an entry of a megabyte.
 pub const BATCH_BRICKS: u32 = 2048;
 
-const STAGE: Stage = Stage { name: "encode", version: 1 };
-const BASE: Stage = Stage { name: "batch", version: 1 };
+const STAGE: Stage = Stage { name: "encode", version: 1, travels: false };
+const BASE: Stage = Stage { name: "batch", version: 1, travels: false };
 
 /// Where the results of one grid's frames are kept.
 #[derive(Clone)]
@@ -108,7 +108,9 @@ struct Found {
 
 impl Batch {
     fn key(&self, kind: Kind) -> Option<Key> {
-        self.base.map(|base| Key::new(&STAGE, &(base.digest(), kind)))
+        // The other codecs are made as fast as a network brings their texels.
+        let stage = Stage { travels: kind == Kind::Texels(KeptCodec::Bc7), ..STAGE };
+        self.base.map(|base| Key::new(&stage, &(base.digest(), kind)))
     }
 
     fn find(&self, tree: &SequenceTree, cache: &Cache, kind: Kind) -> Option<Found> {
@@ -227,6 +229,7 @@ impl Encodings {
         // Some at a time, since an entry is a megabyte.
         for wanted in wanted.chunks(64) {
             let batches = &self.batches.all;
+            cache.prefetch(wanted.iter().filter_map(|&(batch, kind)| batches[batch].key(kind)));
             let found: Vec<Found> = wanted
                 .par_iter()
                 .filter_map(|&(batch, kind)| batches[batch].find(tree, &cache, kind))
