@@ -1,9 +1,13 @@
 //! What is written aside, to be renamed when it is whole: how it becomes everyone's, and what a killed process leaves.
 
-use std::fs::File;
-use std::io;
+use std::fs::{self, File};
+use std::io::{self, Write};
 use std::path::Path;
 use std::time::Duration;
+
+use tempfile::NamedTempFile;
+
+use crate::error::{Error, Result};
 
 /// A file that was being written this long ago was left by a process that was killed.
 pub(crate) const LEFT_BEHIND: Duration = Duration::from_secs(24 * 3600);
@@ -15,12 +19,32 @@ pub(crate) fn is_temporary(path: &Path, prefix: &str) -> bool {
     name.strip_prefix(prefix).is_some_and(is_random)
 }
 
+/// Writes a file in one step, and makes its folder if need be.
+pub(crate) fn write(path: &Path, bytes: &[u8]) -> Result<()> {
+    let mut file = beside(path)?;
+    file.write_all(bytes).map_err(Error::io(path))?;
+    persist(file, path)
+}
+
+/// A file that will be moved to `path`, whose folder is made if need be.
+pub(crate) fn beside(path: &Path) -> Result<NamedTempFile> {
+    let folder = path.parent().filter(|f| *f != Path::new("")).unwrap_or(Path::new("."));
+    fs::create_dir_all(folder).map_err(Error::io(folder))?;
+    NamedTempFile::new_in(folder).map_err(Error::io(path))
+}
+
+/// Moves a finished file to its place, readable by all as other outputs are.
+pub(crate) fn persist(file: NamedTempFile, path: &Path) -> Result<()> {
+    make_readable(file.as_file()).map_err(Error::io(path))?;
+    file.persist(path).map(drop).map_err(|e| Error::io(path)(e.error))
+}
+
 /// Temporary files are made for their owner alone; what becomes of them is for everyone, as any other output.
 pub(crate) fn make_readable(file: &File) -> io::Result<()> {
     #[cfg(unix)]
     {
         use std::os::unix::fs::PermissionsExt;
-        file.set_permissions(std::fs::Permissions::from_mode(0o644))?;
+        file.set_permissions(fs::Permissions::from_mode(0o644))?;
     }
     let _ = file;
     Ok(())

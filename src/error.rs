@@ -70,6 +70,9 @@ pub enum Error {
     /// The user ended it.
     #[error("interrupted: outputs are as they were, and what was done so far is kept for the next build")]
     Interrupted,
+    /// Limits that are past, a line each.
+    #[error("over budget:{0}")]
+    Budget(String),
     /// A pack that does not say what its source says.
     #[error("{0}")]
     Verify(String),
@@ -125,6 +128,7 @@ impl Error {
             Self::Changed(_) | Self::Misled(_) => 3,
             Self::OutOfRange { .. } => 3,
             Self::Verify(_) => 4,
+            Self::Budget(_) => 5,
             Self::Unsupported(_) => 6,
             // What shells say of a process that Ctrl-C ended.
             Self::Interrupted => 130,

@@ -15,7 +15,7 @@
 //! - [`pack`] is the file format: writer, reader, checks, decoder.
 //! - [`pipeline`] strings the stages together, [`manifest`] says with what [`settings`].
 //! - [`cache`] keeps what stages made, so that the second build is instant.
-//! - [`verify`] compares a finished pack with its source, [`report`] puts files into figures.
+//! - [`verify`] compares a finished pack with its source, [`report`] puts files into figures and pages.
 //! - [`render`] traces pictures of packs and sources, on the CPU and through wgpu.
 //! - [`sweep`] measures many settings side by side, and how steady each is.
 //! - [`cli`] is the command line; [`interrupt`] ends long work in good order.
@@ -47,6 +47,7 @@ pub mod report;
 pub mod settings;
 pub mod stages;
 pub mod sweep;
+mod units;
 pub mod vdb;
 pub mod verify;
 pub mod volume;

@@ -7,8 +7,8 @@ use serde::Deserialize;
 
 use crate::error::{Error, Result};
 use crate::settings::{
-    ByteSize, ClusterArgs, DEFAULT_ZSTD, Dedup, ErrorBound, Format, Masks, NonFinite, QualityArgs, RangeMode,
-    Settings,
+    Budget, ByteSize, ClusterArgs, DEFAULT_ZSTD, Dedup, ErrorBound, Format, Masks, NonFinite, QualityArgs,
+    RangeMode, Settings,
 };
 
 /// The manifest's name where none is given.
@@ -19,6 +19,8 @@ pub const DEFAULT_NAME: &str = "pipeline.toml";
 pub struct Manifest {
     /// The assets by name.
     pub assets: BTreeMap<String, Asset>,
+    /// What all of them together may cost, and each has to keep.
+    pub budget: Budget,
 }
 
 /// One asset of a manifest: a sequence, its settings, and its pack.
@@ -32,6 +34,8 @@ pub struct Asset {
     pub settings: Settings,
     /// The largest mean FLIP of its pictures.
     pub max_flip: Option<f64>,
+    /// What it may cost and has to keep.
+    pub budget: Budget,
 }
 
 #[derive(Deserialize)]
@@ -39,6 +43,8 @@ pub struct Asset {
 struct RawManifest {
     #[serde(default)]
     asset: BTreeMap<String, RawAsset>,
+    #[serde(default)]
+    budget: Budget,
 }
 
 #[derive(Deserialize)]
@@ -70,6 +76,8 @@ struct RawAsset {
     fps: Option<toml::Spanned<f32>>,
     max_flip: Option<toml::Spanned<f64>>,
     output: Option<PathBuf>,
+    #[serde(default)]
+    budget: Budget,
 }
 
 #[derive(Deserialize)]
@@ -95,9 +103,9 @@ impl Manifest {
         let assets = raw
             .asset
             .into_iter()
-            .map(|(name, asset)| Ok((name.clone(), asset.into_asset(&name, text, folder)?)))
+            .map(|(name, asset)| Ok((name.clone(), asset.into_asset(&name, &raw.budget, text, folder)?)))
             .collect::<Result<_, String>>()?;
-        Ok(Self { assets })
+        Ok(Self { assets, budget: raw.budget })
     }
 
     /// The asset of that name.
@@ -113,7 +121,7 @@ impl Manifest {
 }
 
 impl RawAsset {
-    fn into_asset(self, name: &str, text: &str, folder: &Path) -> Result<Asset, String> {
+    fn into_asset(self, name: &str, all: &Budget, text: &str, folder: &Path) -> Result<Asset, String> {
         let grids = match (self.grid, self.grids) {
             (Some(_), Some(_)) => return Err(format!("asset {name:?}: give grid or grids, not both")),
             (Some(grid), None) => vec![grid],
@@ -163,6 +171,7 @@ impl RawAsset {
             frames: frames.into_iter().map(|f| folder.join(f)).collect(),
             output: folder.join(output),
             max_flip,
+            budget: all.of_asset(&self.budget),
             settings: Settings {
                 grids,
                 format: self.format,

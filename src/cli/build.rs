@@ -5,10 +5,15 @@ use serde_json::{Value as Json, json};
 
 use super::jobs::JobArgs;
 use super::progress::Reporter;
-use super::style::{self, GOOD, TITLE};
+use super::style::{GOOD, TITLE};
 use super::{Common, outln, print_json};
 use crate::error::{Error, Result};
+use crate::pack::Pack;
 use crate::pipeline::{Job, Made, Outcome, VerifyLevel, build};
+use crate::report::model::{Figures, Total};
+use crate::report::{Breach, Checked, of_total};
+use crate::settings::Budget;
+use crate::units;
 
 #[derive(Args)]
 pub struct BuildArgs {
@@ -23,30 +28,69 @@ pub fn run(args: &BuildArgs, common: Common) -> Result<()> {
     let mut assets = Vec::new();
     let mut failure = None;
     let cache = args.jobs.open_cache();
+    let (all, limits) = args.jobs.budgets()?;
+    let mut built: Vec<(String, Figures)> = Vec::new();
+    let mut breaches: Vec<Breach> = Vec::new();
     for (name, job) in args.jobs.jobs(cache.as_ref(), VerifyLevel::All)? {
         if matches!(failure, Some(Error::Interrupted)) {
             break;
         }
         let mut asset = json!({ "asset": name });
-        if let Err(error) = job.and_then(|job| build_one(&name, &job, args, common, &mut asset)) {
-            asset["error"] = error.to_string().into();
-            // One bad asset does not keep the others from being built. All errors are printed, the
-            // last by the caller.
-            failure.replace(error).iter().for_each(super::print_error);
+        let made = job.and_then(|job| {
+            let outcome = build_one(&name, &job, args, common, &mut asset)?;
+            let limits = limits.get(&name).copied().unwrap_or_default();
+            check(&name, &job, &outcome, &limits, &mut breaches)
+        });
+        match made {
+            Ok(figures) => built.push((name, figures)),
+            Err(error) => {
+                asset["error"] = error.to_string().into();
+                // One bad asset does not keep the others from being built. All errors are printed, the
+                // last by the caller.
+                failure.replace(error).iter().for_each(super::print_error);
+            }
         }
         assets.push(asset);
     }
     if let Some(cache) = cache.filter(|_| !matches!(failure, Some(Error::Interrupted))) {
         super::cache::finish(&cache, common.quiet || args.json);
     }
+    let packs: Vec<(&str, &Figures)> = built.iter().map(|(name, figures)| (&**name, figures)).collect();
+    breaches.extend(of_total(&Total::new(&packs, &all), &packs));
     if args.json {
-        print_json(&json!({ "assets": assets }));
+        print_json(&json!({ "assets": assets, "breaches": breaches }));
     }
-    failure.map_or(Ok(()), Err)
+    match failure {
+        Some(failure) => Err(failure),
+        None if breaches.is_empty() => Ok(()),
+        None => Err(super::report::over_budget(&breaches)),
+    }
+}
+
+/// A pack's figures; adds every limit that it is past.
+fn check(
+    name: &str,
+    job: &Job,
+    outcome: &Outcome,
+    budget: &Budget,
+    breaches: &mut Vec<Breach>,
+) -> Result<Figures> {
+    let pack = Pack::open(&job.output).map_err(Error::pack(&job.output))?;
+    let found = outcome.verification.as_ref();
+    let seconds = |stage: Option<&str>| {
+        let of_stage = outcome.seconds.iter().filter(|(name, _)| stage.is_none_or(|stage| stage == *name));
+        of_stage.map(|(_, seconds)| seconds).sum()
+    };
+    let figures = Figures::new(&outcome.summary, &pack, found, Some(seconds(None)));
+    let verify_seconds = seconds(Some("verify"));
+    let checked =
+        Checked { name, budget, figures: &figures, baseline: None, pack: &pack, found, verify_seconds };
+    breaches.extend(checked.breaches());
+    Ok(figures)
 }
 
 /// Builds one pack and adds to `asset` what JSON says of it.
-fn build_one(name: &str, job: &Job, args: &BuildArgs, common: Common, asset: &mut Json) -> Result<()> {
+fn build_one(name: &str, job: &Job, args: &BuildArgs, common: Common, asset: &mut Json) -> Result<Outcome> {
     let mut reporter = Reporter::new(name, common.quiet || args.json);
     let outcome = build(job, &mut reporter);
     reporter.finish();
@@ -62,17 +106,17 @@ fn build_one(name: &str, job: &Job, args: &BuildArgs, common: Common, asset: &mu
     asset["verification"] = json!(outcome.verification);
     asset["made"] = json!(outcome.made);
     asset["cache"] = json!(outcome.cache);
-    match &outcome.verification {
-        Some(report) => super::verify::verdict(&job.output, report).map_err(|e| {
+    if let Some(report) = &outcome.verification {
+        super::verify::verdict(&job.output, report).map_err(|e| {
             Error::Verify(format!("{e}\n  It was not written; --verify none writes it all the same."))
-        }),
-        None => Ok(()),
+        })?;
     }
+    Ok(outcome)
 }
 
 fn print(name: &str, job: &Job, outcome: &Outcome, verbose: bool) {
     let pack = &outcome.summary;
-    let bytes = style::bytes;
+    let bytes = units::bytes;
     outln!("{TITLE}{name}{TITLE:#} -> {} ({})", job.output.display(), bytes(pack.file_bytes));
     super::inspect::print_sizes(pack);
     if let Some(report) = &outcome.verification {
@@ -95,5 +139,5 @@ fn print(name: &str, job: &Job, outcome: &Outcome, verbose: bool) {
         Made::Copied => "taken from the cache",
         Made::Unchanged => "up to date",
     };
-    outln!("  {GOOD}{how}{GOOD:#} in {}", style::seconds(total));
+    outln!("  {GOOD}{how}{GOOD:#} in {}", units::seconds(total));
 }

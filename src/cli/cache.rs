@@ -8,13 +8,14 @@ use clap::{Args, Subcommand};
 use serde_json::json;
 
 use super::progress::Reporter;
-use super::style::{GOOD, TITLE, WARNING, bytes, count};
+use super::style::{GOOD, TITLE, WARNING};
 use super::{Common, outln, print_json};
 use crate::cache::Cache;
 use crate::cache::remote::{Policy, Remote};
 use crate::error::{Error, Result};
 use crate::pipeline::Progress;
 use crate::settings::ByteSize;
+use crate::units::{bytes, count};
 
 /// Where what builds make is kept.
 #[derive(Args, Clone)]

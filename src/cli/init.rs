@@ -7,10 +7,11 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::style::{TITLE, WARNING, count};
+use super::style::{TITLE, WARNING};
 use super::{Common, outln};
 use crate::error::{Error, Result};
 use crate::manifest::DEFAULT_NAME;
+use crate::units::count;
 use crate::vdb::{GridInfo, VdbFile};
 
 /// What every key of a manifest means: the head of the project's own.

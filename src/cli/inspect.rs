@@ -6,11 +6,12 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::style::{TITLE, bytes, count};
+use super::style::TITLE;
 use super::{outln, print_json};
 use crate::error::{Error, Result};
 use crate::pack::{Pack, layout};
 use crate::report::{GridSummary, PackSummary, VdbSummary};
+use crate::units::{bytes, count};
 
 #[derive(Args)]
 pub struct InspectArgs {

@@ -1,6 +1,6 @@
 //! What there is to build, as the command line or a manifest says it.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -12,6 +12,7 @@ use crate::cache::Cache;
 use crate::error::{Error, Result};
 use crate::manifest::{Asset, DEFAULT_NAME, Manifest, expand};
 use crate::pipeline::{Job, VerifyLevel};
+use crate::settings::Budget;
 
 #[derive(Args)]
 pub struct JobArgs {
@@ -44,6 +45,19 @@ impl JobArgs {
     /// The cache that is asked for.
     pub fn open_cache(&self) -> Option<Arc<Cache>> {
         self.cache.open_with(&self.remote)
+    }
+
+    /// What all assets together may cost, and what each that is asked for has to keep, by name. Sums are limits of all
+    /// assets, not of some.
+    pub fn budgets(&self) -> Result<(Budget, BTreeMap<String, Budget>)> {
+        if !self.frames.is_empty() {
+            return Ok(Default::default());
+        }
+        let each =
+            assets(&self.manifest, &self.assets)?.into_iter().map(|(name, asset)| (name, asset.budget));
+        let all =
+            if self.assets.is_empty() { Manifest::read(&self.manifest)?.budget } else { Budget::default() };
+        Ok((all, each.collect()))
     }
 
     /// The packs that are asked for, with the names to show, checked as `verify` says where nothing is said.

@@ -8,6 +8,7 @@ mod inspect;
 mod jobs;
 mod progress;
 mod render;
+mod report;
 mod style;
 mod sweep;
 mod verify;
@@ -78,6 +79,8 @@ enum Command {
     Verify(verify::VerifyArgs),
     /// Trace pictures of a pack
     Render(render::RenderArgs),
+    /// Put sizes, quality and budgets on one page, and into JSON, Markdown and JUnit XML
+    Report(Box<report::ReportArgs>),
     /// Measure many settings of a volume and chart quality against size and speed
     Sweep(sweep::SweepArgs),
 }
@@ -195,7 +198,8 @@ pub fn run(cli: Cli) -> Result<()> {
             .build_global()
             .map_err(|e| Error::Usage(format!("--threads {threads}: {e}")))?;
     }
-    if matches!(cli.command, Command::Build(_) | Command::Watch(_) | Command::Verify(_)) {
+    if matches!(cli.command, Command::Build(_) | Command::Watch(_) | Command::Verify(_) | Command::Report(_))
+    {
         crate::interrupt::catch();
     }
     match cli.command {
@@ -207,6 +211,7 @@ pub fn run(cli: Cli) -> Result<()> {
         Command::Inspect(args) => inspect::run(&args),
         Command::Verify(args) => verify::run(&args, cli.common),
         Command::Render(args) => render::run(&args, cli.common),
+        Command::Report(args) => report::run(&args, cli.common),
         Command::Sweep(args) => sweep::run(&args, cli.common),
     }
 }

@@ -1,17 +1,16 @@
 //! `volpack render`.
 
-use std::fs::File;
 use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
 
 use super::{Common, outln, style};
+use crate::aside;
 use crate::error::{Error, Result};
 use crate::pack::Pack;
 use crate::render::gpu::GpuError;
 use crate::render::{Device, Mode, Renderer, Scene, Traversal, View, write_apng, write_png};
-use crate::vdb::GridClass;
 
 #[derive(Args)]
 pub struct RenderArgs {
@@ -78,11 +77,7 @@ pub fn run(args: &RenderArgs, common: Common) -> Result<()> {
         anstream::eprintln!("tracing with {}{why}", renderer.device_name());
     }
 
-    let mode = args.mode.unwrap_or(if pack.grids[grid].record.class == GridClass::LevelSet as u32 {
-        Mode::Lit
-    } else {
-        Mode::Density
-    });
+    let mode = args.mode.unwrap_or(Mode::of_grid(&pack.grids[grid]));
     // One camera for all frames: around everything that any of them has.
     let mut bounds = crate::volume::CoordBox::EMPTY;
     frames.iter().for_each(|&f| bounds.union(pack.frame_tree(grid, f).bounds()));
@@ -129,9 +124,7 @@ fn frames(args: &RenderArgs, pack: &Pack, grid: usize) -> Result<Vec<usize>> {
 
 fn write(args: &RenderArgs, pictures: &[Vec<u8>], fps: f32) -> Result<()> {
     let failed = || Error::io(&args.output);
-    let folder = args.output.parent().filter(|f| *f != Path::new("")).unwrap_or(Path::new("."));
-    std::fs::create_dir_all(folder).map_err(Error::io(folder))?;
-    let file = tempfile::NamedTempFile::new_in(folder).map_err(failed())?;
+    let file = aside::beside(&args.output)?;
     let out = BufWriter::new(file.as_file());
     match pictures {
         [one] => write_png(out, args.size, one).map_err(failed())?,
@@ -144,13 +137,7 @@ fn write(args: &RenderArgs, pictures: &[Vec<u8>], fps: f32) -> Result<()> {
             write_png(out, size, &sheet).map_err(failed())?;
         }
     }
-    persist(file, &args.output)
-}
-
-/// Moves a finished file to its place, readable by all as other outputs are.
-pub fn persist(file: tempfile::NamedTempFile<File>, path: &Path) -> Result<()> {
-    crate::aside::make_readable(file.as_file()).map_err(Error::io(path))?;
-    file.persist(path).map(drop).map_err(|e| Error::io(path)(e.error))
+    aside::persist(file, &args.output)
 }
 
 /// Frames left to right and top to bottom, in a sheet about as wide as it is high.

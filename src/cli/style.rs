@@ -1,5 +1,4 @@
-//! Colours, and numbers for people. `anstream` drops colours where there is no terminal or `NO_COLOR`
-//! is set.
+//! Colours. `anstream` drops them where there is no terminal or `NO_COLOR` is set.
 
 use anstyle::{AnsiColor, Style};
 
@@ -7,23 +6,3 @@ pub const ERROR: Style = AnsiColor::Red.on_default().bold();
 pub const WARNING: Style = AnsiColor::Yellow.on_default().bold();
 pub const GOOD: Style = AnsiColor::Green.on_default();
 pub const TITLE: Style = Style::new().bold();
-
-/// 1,234,567.
-pub fn count(n: u64) -> String {
-    indicatif::HumanCount(n).to_string()
-}
-
-/// 1.23 MiB.
-pub fn bytes(n: u64) -> String {
-    indicatif::BinaryBytes(n).to_string()
-}
-
-/// A PSNR, or that there is no error.
-pub fn psnr(psnr: Option<f64>) -> String {
-    psnr.map_or_else(|| "exact".to_owned(), |db| format!("{db:.2} dB"))
-}
-
-/// 12 ms, or 3.4 s.
-pub fn seconds(seconds: f64) -> String {
-    if seconds < 1.0 { format!("{:.0} ms", seconds * 1e3) } else { format!("{seconds:.1} s") }
-}

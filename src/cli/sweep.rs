@@ -7,13 +7,15 @@ use serde::Serialize;
 use serde_json::json;
 
 use super::progress::Reporter;
-use super::style::{TITLE, WARNING, psnr};
+use super::style::{TITLE, WARNING};
 use super::{Common, outln};
+use crate::aside;
 use crate::error::{Error, Result};
 use crate::manifest::expand;
 use crate::report::chart::{Point, Spread, stability_svg, sweep_svg};
 use crate::settings::NonFinite;
 use crate::sweep::{Options, Skipped, Stability, Sweep, fronts, measure, stability};
+use crate::units::psnr;
 
 #[derive(Args)]
 pub struct SweepArgs {
@@ -104,10 +106,13 @@ fn write_sweep(options: &Options, sweep: &Sweep, folder: &Path) -> Result<Vec<St
         _ => cores(),
     };
     let svg = sweep_svg(&options.name, &subtitle, &sweep.points).map_err(|e| Error::Other(e.to_string()))?;
-    write(&folder.join("sweep.svg"), svg.as_bytes())?;
+    aside::write(&folder.join("sweep.svg"), svg.as_bytes())?;
     let json = json!({ "volpack": env!("CARGO_PKG_VERSION"), "volume": options.name, "frames": options.frames.len(),
         "machine": cores(), "device": sweep.device, "trace": options.trace, "points": rows, "skipped": sweep.skipped });
-    write(&folder.join("sweep.json"), &serde_json::to_vec_pretty(&json).expect("figures are numbers"))?;
+    aside::write(
+        &folder.join("sweep.json"),
+        &serde_json::to_vec_pretty(&json).expect("figures are numbers"),
+    )?;
     let header = "volume,method,setting,gpu_bytes,bits_per_voxel,psnr_db,max_error_of_range,build_seconds,trace_ms,\
         blockiness,front_in_size,front_in_seconds,front_in_trace,failures";
     let csv = rows.iter().map(|r| {
@@ -160,10 +165,13 @@ fn write_sweep(options: &Options, sweep: &Sweep, folder: &Path) -> Result<Vec<St
 fn write_stability(options: &Options, found: &Stability, folder: &Path) -> Result<Vec<String>> {
     let svg = stability_svg(&options.name, "On 1, 2 and 3 threads", &found.spreads)
         .map_err(|e| Error::Other(e.to_string()))?;
-    write(&folder.join("stability.svg"), svg.as_bytes())?;
+    aside::write(&folder.join("stability.svg"), svg.as_bytes())?;
     let json = json!({ "volpack": env!("CARGO_PKG_VERSION"), "volume": options.name, "frames": options.frames.len(),
         "spreads": found.spreads, "skipped": found.skipped });
-    write(&folder.join("stability.json"), &serde_json::to_vec_pretty(&json).expect("figures are numbers"))?;
+    aside::write(
+        &folder.join("stability.json"),
+        &serde_json::to_vec_pretty(&json).expect("figures are numbers"),
+    )?;
     let header = "volume,method,setting,runs,psnr_least,psnr_most,bits_per_voxel_least,bits_per_voxel_most,\
         max_error_least,max_error_most,blockiness_least,blockiness_most,failures";
     let csv = found.spreads.iter().map(|s: &Spread| {
@@ -201,10 +209,6 @@ fn skipped(skipped: &[Skipped]) -> impl Iterator<Item = String> + '_ {
 fn cores() -> String {
     let cores = rayon::current_num_threads();
     format!("{cores} CPU thread{}", if cores == 1 { "" } else { "s" })
-}
-
-fn write(path: &Path, bytes: &[u8]) -> Result<()> {
-    std::fs::write(path, bytes).map_err(Error::io(path))
 }
 
 fn write_csv<R: AsRef<[String]>>(path: &Path, header: &str, rows: impl Iterator<Item = R>) -> Result<()> {

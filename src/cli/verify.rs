@@ -6,11 +6,12 @@ use clap::{Args, ValueEnum};
 use serde_json::json;
 
 use super::progress::Reporter;
-use super::style::{ERROR, GOOD, TITLE, psnr};
+use super::style::{ERROR, GOOD, TITLE};
 use super::{Common, PictureArgs, outln, print_json};
 use crate::error::{Error, Result};
 use crate::manifest::{DEFAULT_NAME, Manifest, expand};
 use crate::pipeline::{check_structure, verify_against};
+use crate::units::psnr;
 use crate::verify::{PicturesReport, VerifyReport};
 
 #[derive(Args)]

@@ -7,13 +7,14 @@ use std::time::{Duration, Instant, SystemTime};
 use clap::Args;
 
 use super::jobs::JobArgs;
-use super::style::{ERROR, GOOD, TITLE, WARNING, bytes, psnr, seconds};
+use super::style::{ERROR, GOOD, TITLE, WARNING};
 use super::{Common, outln};
 use crate::cache::Stamp;
 use crate::error::{Error, Result};
 use crate::interrupt;
 use crate::pipeline::{Job, Made, Outcome, Progress, VerifyLevel, build};
 use crate::settings::Settings;
+use crate::units::{bytes, psnr, seconds};
 
 /// How often files are looked at. Asking beats being told: network drives, where farms render to, tell nothing.
 const LOOK_EVERY: Duration = Duration::from_millis(200);

@@ -334,6 +334,11 @@ impl Pack {
         self.bytes.len() as u64
     }
 
+    /// Those of them that texels take.
+    pub fn stored_texel_bytes(&self) -> u64 {
+        self.sections.iter().filter(|s| s.kind == kind::TEXELS).map(|s| s.stored_bytes).sum()
+    }
+
     /// How many chunks there are, texels and all.
     pub(super) fn chunk_count(&self) -> usize {
         self.chunks.len()

@@ -16,6 +16,7 @@ use crate::cache::{Cache, Uses};
 use crate::error::{Error, Result};
 use crate::pack::{FinishedPack, Pack, Provenance, Source};
 use crate::report::PackSummary;
+pub use crate::report::model::Made;
 use crate::settings::{Format, NOT_WITH_ADAPTIVE, Settings};
 use crate::stages::metadata::{self, Digests, SequenceInfo};
 use crate::stages::quantise::QuantiseError;
@@ -100,20 +101,6 @@ pub struct Outcome {
     pub was_verified: bool,
     /// How often each stage's results were found in the cache, and how often not.
     pub cache: BTreeMap<&'static str, Uses>,
-}
-
-/// How a pack came to be.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Made {
-    /// By the stages, each with what the cache had for it.
-    Built,
-    /// From a pack that differs in nothing but zstd's level.
-    Repacked,
-    /// It was in the cache.
-    Copied,
-    /// It was there already.
-    Unchanged,
 }
 
 /// Builds one pack, and verifies it as the job asks.

@@ -13,7 +13,7 @@ use crate::verify::VerifyReport;
 const PACK: Stage = Stage { name: "pack", version: 1, travels: true };
 /// A pack whose level of zstd is not what was asked for, but all else is.
 const ANY_LEVEL: Stage = Stage { name: "pack-any-zstd", version: 1, travels: true };
-const VERIFY: Stage = Stage { name: "verify", version: 1, travels: true };
+const VERIFY: Stage = Stage { name: "verify", version: 2, travels: true };
 
 /// What the cache may have for a job.
 pub(super) struct Reuse<'a> {

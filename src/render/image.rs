@@ -89,7 +89,7 @@ pub fn write_apng(out: impl Write, size: [u32; 2], frames: &[Vec<u8>], fps: u16)
 }
 
 /// How far two pictures are apart.
-#[derive(Clone, Copy, Debug, serde::Serialize, serde::Deserialize)]
+#[derive(Clone, Copy, Debug, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
 pub struct Difference {
     /// Root mean square over pixels and channels of the displayed picture, of 1.
     pub rmse: f64,

@@ -26,6 +26,9 @@ pub use traverse::{Box3, Ray, Real, Walk};
 
 use clap::ValueEnum;
 
+use crate::pack::Grid;
+use crate::vdb::GridClass;
+
 /// What a picture shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Mode {
@@ -59,6 +62,11 @@ impl Mode {
         Self::Normals,
         Self::Lit,
     ];
+
+    /// What shows a grid as people expect it.
+    pub fn of_grid(grid: &Grid) -> Self {
+        if grid.record.class == GridClass::LevelSet as u32 { Self::Lit } else { Self::Density }
+    }
 
     /// Whether pixels are categories, which two tracers share or do not, rather than measures.
     pub fn is_categorical(self) -> bool {

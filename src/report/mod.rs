@@ -1,8 +1,129 @@
-//! What files hold, as people and machines read it.
+//! What files hold and what packs cost, as people and machines read it.
 
+mod baseline;
+mod budget;
 pub mod chart;
+mod frames;
+mod gallery;
+mod html;
+mod junit;
+mod markdown;
+pub mod model;
 mod pack;
 mod vdb;
 
+use std::path::Path;
+
+pub use baseline::Baseline;
+pub use budget::{Breach, Checked, of_total};
+pub use gallery::{Gallery, KeyFrame, Png, Strip, gallery};
+pub use html::html;
+pub use junit::junit;
+pub use markdown::markdown;
 pub use pack::{CodecSummary, PackSummary};
 pub use vdb::{GridSummary, ValueSummary, VdbSummary};
+
+use crate::pack::Pack;
+use crate::settings::Budget;
+use crate::verify::VerifyReport;
+use model::{AssetReport, BuildReport, Cheaper, Figures, PackReport, Report, Reproduce, Total};
+
+/// The JSON schema of a report.
+pub fn schema() -> serde_json::Value {
+    schemars::schema_for!(Report).into()
+}
+
+/// What is known of a pack that is reported.
+pub struct Reported<'a> {
+    /// The asset's name.
+    pub name: &'a str,
+    /// The pack.
+    pub pack: &'a Pack,
+    /// Its file.
+    pub file: &'a Path,
+    /// BLAKE3 of the file.
+    pub digest: blake3::Hash,
+    /// What was found of it.
+    pub found: Option<VerifyReport>,
+    /// How it came to be.
+    pub build: Option<BuildReport>,
+    /// What a cheaper setting gives.
+    pub cheaper: Option<Cheaper>,
+    /// What to type to make it again.
+    pub command: String,
+    /// Its limits.
+    pub budget: &'a Budget,
+    /// What changes are told against.
+    pub baseline: Option<&'a Baseline>,
+}
+
+impl Reported<'_> {
+    /// The figures, and every limit that is past.
+    pub fn report(self) -> (PackReport, Vec<Breach>) {
+        let pack = self.pack;
+        let summary = PackSummary::new(pack);
+        let seconds = self.build.as_ref().map(|build| build.stages.iter().map(|stage| stage.seconds).sum());
+        let figures = Figures::new(&summary, pack, self.found.as_ref(), seconds);
+        let baseline = self.baseline.and_then(|baseline| baseline.figures(self.name));
+        let of_verify = |build: &BuildReport| {
+            build.stages.iter().filter(|stage| stage.stage == "verify").map(|stage| stage.seconds).sum()
+        };
+        let breaches = budget::Checked {
+            name: self.name,
+            budget: self.budget,
+            figures: &figures,
+            baseline,
+            pack,
+            found: self.found.as_ref(),
+            verify_seconds: self.build.as_ref().map_or(0.0, of_verify),
+        }
+        .breaches();
+        let mut settings = serde_json::to_value(&pack.provenance.settings).unwrap_or_default();
+        settings["quality"] = pack.provenance.settings.quality.to_string().into();
+        let report = PackReport {
+            file: self.file.display().to_string(),
+            change: baseline.map(|old| figures.change_from(old)),
+            frames: frames::costs(pack, self.found.as_ref()),
+            figures,
+            summary,
+            verification: self.found,
+            build: self.build,
+            cheaper: self.cheaper,
+            reproduce: Reproduce {
+                command: self.command,
+                tool: format!("{} {}", pack.provenance.tool, pack.provenance.version),
+                encoder_isa: pack.provenance.encoder_isa.clone(),
+                settings,
+                blake3: self.digest.to_hex().to_string(),
+                sources: pack.provenance.sources.iter().map(Into::into).collect(),
+            },
+        };
+        (report, breaches)
+    }
+}
+
+impl Report {
+    /// Puts assets together, and checks what all of them may cost.
+    pub fn new(
+        assets: Vec<AssetReport>,
+        mut breaches: Vec<Breach>,
+        budget: &Budget,
+        manifest: Option<String>,
+        baseline: Option<String>,
+    ) -> Self {
+        let packs = assets.iter().filter_map(|asset| Some((&*asset.name, &asset.pack.as_ref()?.figures)));
+        let packs: Vec<(&str, &Figures)> = packs.collect();
+        let total = Total::new(&packs, budget);
+        breaches.extend(budget::of_total(&total, &packs));
+        Self {
+            version: model::VERSION,
+            tool: format!("{} {}", env!("CARGO_PKG_NAME"), env!("CARGO_PKG_VERSION")),
+            manifest,
+            baseline,
+            ok: breaches.is_empty() && assets.iter().all(|asset| asset.error.is_none()),
+            assets,
+            total,
+            breaches,
+        }
+    }
+}

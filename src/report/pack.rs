@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet, HashSet};
 
+use schemars::JsonSchema;
 use serde::Serialize;
 
 use crate::codec::Codec;
@@ -9,7 +10,7 @@ use crate::pack::tree::{MASK_WORDS, RECORD_WORDS, header};
 use crate::pack::{Atlas, Pack};
 
 /// A pack's sizes and counts.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, JsonSchema)]
 pub struct PackSummary {
     /// The grids' names.
     pub grids: Vec<String>,
@@ -40,7 +41,7 @@ pub struct PackSummary {
 }
 
 /// The bricks of one codec.
-#[derive(Clone, Copy, Debug, Default, Serialize)]
+#[derive(Clone, Copy, Debug, Default, Serialize, JsonSchema)]
 pub struct CodecSummary {
     /// How many there are.
     pub bricks: u64,

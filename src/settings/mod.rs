@@ -1,11 +1,13 @@
 //! What a build can be asked for: the words of the manifest, the command line and a pack's provenance.
 
+mod budget;
 mod clustering;
 mod quality;
 
 use clap::ValueEnum;
 use serde::{Deserialize, Serialize};
 
+pub use budget::{Budget, Share};
 pub use clustering::{ClusterArgs, Clustering, Dedup, NOT_WITH_ADAPTIVE};
 pub use quality::{ByteSize, DEFAULT_PSNR, ErrorBound, FRAME_MARGIN_DB, Quality, QualityArgs, above_zero};
 

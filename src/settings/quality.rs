@@ -79,6 +79,11 @@ impl ErrorBound {
         }
     }
 
+    /// So many times as large a bound.
+    pub fn times(self, factor: f64) -> Self {
+        Self { value: self.value * factor, ..self }
+    }
+
     /// The fraction of the range, where that is what it is given in.
     pub fn fraction(self) -> Option<f64> {
         (self.unit == ErrorUnit::Range).then_some(self.value)
@@ -228,7 +233,9 @@ impl QualityArgs {
 }
 
 /// Reads what `FromStr` reads, and plain numbers too.
-fn from_text_or_number<'de, D: Deserializer<'de>, T: FromStr<Err = String>>(d: D) -> Result<T, D::Error> {
+pub(super) fn from_text_or_number<'de, D: Deserializer<'de>, T: FromStr<Err = String>>(
+    d: D,
+) -> Result<T, D::Error> {
     #[derive(Deserialize)]
     #[serde(untagged, expecting = "a number, or a text with a unit")]
     enum Raw {

@@ -1,5 +1,6 @@
 //! Measures many settings of one volume side by side, and how steady each is.
 
+mod cheaper;
 mod field;
 pub mod nanovdb;
 mod noise;
@@ -15,6 +16,7 @@ use crate::pipeline::{Job, Progress, VerifyLevel};
 use crate::report::chart::{self, Point, Spread};
 use crate::settings::{Clustering, ErrorBound, Format, NonFinite, Quality, RangeMode, Settings};
 
+pub use cheaper::cheaper;
 pub use field::{Difference, Jumps};
 pub use points::{difference, measure};
 pub use stability::stability;

@@ -40,6 +40,22 @@ impl Error {
     }
 }
 
+/// Bins of [`Histogram`]: no error, below 2⁻¹⁵ of the range, fourteen octaves, and half of the range and more.
+pub const ERROR_BINS: usize = 17;
+
+/// How many voxels have an error of 0, of less than 2⁻¹⁵ of the range of values, and so on by octaves to 2⁻¹ and more.
+pub type Histogram = [u64; ERROR_BINS];
+
+/// The bin of an error, as a fraction of the range.
+fn bin(error: f64) -> usize {
+    if error == 0.0 {
+        return 0;
+    }
+    // The octave is the float's exponent; infinities and NaNs have the greatest.
+    let octave = (error.to_bits() >> 52 & 0x7ff) as i32 - 1023;
+    (octave + ERROR_BINS as i32).clamp(1, ERROR_BINS as i32 - 1) as usize
+}
+
 /// What differs in one frame.
 #[derive(Clone, Debug, Default)]
 pub(super) struct FrameError {
@@ -47,6 +63,8 @@ pub(super) struct FrameError {
     pub active: Error,
     /// Over all leaf voxels.
     pub all: Error,
+    /// Of active leaf voxels.
+    pub histogram: Histogram,
     /// The range of the source's active values, tiles included.
     pub active_range: Option<ValueRange>,
     /// Squared error over the voxels that texels give.
@@ -64,6 +82,7 @@ impl FrameError {
     fn add(&mut self, other: Self) {
         self.active.add(&other.active);
         self.all.add(&other.all);
+        self.histogram.iter_mut().zip(other.histogram).for_each(|(sum, count)| *sum += count);
         self.texel_squares += other.texel_squares;
         self.active_range = ValueRange::union_all(self.active_range.into_iter().chain(other.active_range));
         self.failures += other.failures;
@@ -88,6 +107,8 @@ struct Comparison<'a, T> {
     tree: &'a Tree<T>,
     reader: &'a FrameReader<'a>,
     settings: &'a Settings,
+    /// The range of the source's active values, as the pack has it.
+    peak: f64,
     /// The error that no voxel may have on any GPU, if that was promised.
     max_error: Option<f64>,
     /// The distance above which a level set's sign counts; `None` for other grids.
@@ -113,6 +134,7 @@ pub(super) fn compare<T: Scalar>(
         tree,
         reader,
         settings,
+        peak,
         max_error,
         sign_matters: is_level_set.then_some(SIGN_MATTERS_VOXELS * voxel_size),
     };
@@ -318,6 +340,9 @@ impl<T: Scalar> Comparison<'_, T> {
             }
             if mask.get(i) {
                 error.active.voxel(difference, flipped);
+                // Where all values are one there is no range to measure by.
+                let scale = if self.peak > 0.0 { self.peak } else { 1.0 };
+                error.histogram[bin(difference.abs() / scale)] += 1;
             }
             let at = || origin.offset_by(Coord::child_offset(i, 3, 1)).0;
             if flipped && self.sign_matters.is_some_and(|d| f64::from(theirs).abs() > d) {

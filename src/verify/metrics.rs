@@ -1,15 +1,16 @@
 //! Errors as people and machines read them.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::PicturesReport;
-use super::compare::{Error, FrameError};
+use super::compare::{ERROR_BINS, Error, FrameError, Histogram};
 use crate::pack::Pack;
 use crate::settings::{FRAME_MARGIN_DB, Format, Quality};
 use crate::volume::ValueRange;
 
 /// How far decoded values are from the source's.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize, JsonSchema)]
 pub struct Metrics {
     /// Voxels compared.
     pub voxels: u64,
@@ -25,7 +26,7 @@ pub struct Metrics {
 }
 
 /// One frame of one grid.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 pub struct FrameReport {
     /// The grid.
     pub grid: String,
@@ -38,7 +39,7 @@ pub struct FrameReport {
 }
 
 /// The frame with the lowest PSNR.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 pub struct WorstFrame {
     /// Its grid.
     pub grid: String,
@@ -49,7 +50,7 @@ pub struct WorstFrame {
 }
 
 /// One grid over all its frames.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 pub struct GridReport {
     /// Its name.
     pub grid: String,
@@ -59,10 +60,12 @@ pub struct GridReport {
     pub active: Metrics,
     /// Over all leaf voxels.
     pub all: Metrics,
+    /// Active leaf voxels by error: none, below 2⁻¹⁵ of the peak, then by octaves to half of the peak and more.
+    pub histogram: Histogram,
 }
 
 /// What the voxel ring found.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 pub struct VerifyReport {
     /// Whether nothing failed.
     pub ok: bool,
@@ -156,9 +159,11 @@ impl VerifyReport {
                 ));
             }
             let (mut active, mut all) = (Error::default(), Error::default());
+            let mut histogram = [0; ERROR_BINS];
             for (frame, error) in grid.frames.iter().zip(errors) {
                 active.add(&error.active);
                 all.add(&error.all);
+                histogram.iter_mut().zip(error.histogram).for_each(|(sum, count)| *sum += count);
                 frames.push(FrameReport {
                     grid: grid.name.clone(),
                     frame: frame.record.number,
@@ -176,6 +181,7 @@ impl VerifyReport {
                 peak,
                 active: Metrics::new(&active, peak),
                 all: Metrics::new(&all, peak),
+                histogram,
             });
         }
         failures.extend(broken_promises(pack, &grids, &frames));

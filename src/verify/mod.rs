@@ -14,10 +14,11 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
-pub use compare::SIGN_MATTERS_VOXELS;
+pub use compare::{ERROR_BINS, Histogram, SIGN_MATTERS_VOXELS};
 pub use metrics::{FrameReport, GridReport, Metrics, VerifyReport, WorstFrame};
 pub use pictures::{
-    PictureReport, PictureSettings, PicturesReport, TracerDifference, pictures, shown_frames,
+    DIFFERENCE_GAIN, PictureReport, PictureSettings, PicturesReport, Seen, TracerDifference, difference_map,
+    look, pictures, shown_frames,
 };
 
 use crate::error::{Error, Result};

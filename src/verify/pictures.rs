@@ -6,6 +6,7 @@
 
 use std::path::{Path, PathBuf};
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::Sources;
@@ -18,7 +19,7 @@ use crate::render::{
 use crate::settings::{DEFAULT_PSNR, Format, Quality, Settings};
 use crate::stages::flatten::flatten;
 use crate::stages::select::find;
-use crate::vdb::{GridClass, VdbFile};
+use crate::vdb::VdbFile;
 
 /// Pixels of a picture's side.
 const SIDE: u32 = 256;
@@ -46,7 +47,7 @@ pub struct PictureSettings {
 }
 
 /// What the picture ring found.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 pub struct PicturesReport {
     /// What traced the pack for half (a); null where there is no GPU and no software Vulkan, and half (a)
     /// was left out.
@@ -62,7 +63,7 @@ pub struct PicturesReport {
 }
 
 /// One picture.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, Serialize, Deserialize, JsonSchema)]
 pub struct PictureReport {
     /// The grid.
     pub grid: String,
@@ -75,7 +76,7 @@ pub struct PictureReport {
 }
 
 /// How far the wgpu tracer is from the CPU tracer.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize, JsonSchema)]
 pub struct TracerDifference {
     /// Pixels that differ by more than the tolerance.
     pub pixels: u64,
@@ -167,19 +168,8 @@ fn compare(
     [g, f]: [usize; 2],
     settings: &PictureSettings,
 ) -> Result<Option<PictureReport>> {
-    let grid = &pack.grids[g];
-    let frame = &grid.frames[f];
-    let damaged = |e: &dyn std::fmt::Display| {
-        Error::Verify(format!("grid {:?} frame {}: {e}", grid.name, frame.record.number))
-    };
-    let packed = Field::from_pack(&pack.frame(g, f).map_err(|e| damaged(&e))?).map_err(|e| damaged(&e))?;
-    if packed.bounds.is_empty() {
-        return Ok(None);
-    }
-    let mode = if grid.record.class == GridClass::LevelSet as u32 { Mode::Lit } else { Mode::Density };
-    let scene = Scene::new(grid, frame, packed.bounds, &View::default(), mode, [SIDE; 2]);
-    let of_pack =
-        trace::<f32>(&packed, &scene).ok_or_else(|| damaged(&"its transform cannot be inverted"))?;
+    let (grid, frame) = (&pack.grids[g], &pack.grids[g].frames[f]);
+    let Some((scene, of_pack)) = trace_pack(pack, [g, f])? else { return Ok(None) };
     let tracers = if renderer.is_gpu() {
         let of_gpu = renderer.render(g, f, &scene).map_err(|e| Error::Other(e.to_string()))?;
         let has_bc4 = pack.atlas(Codec::Bc4).is_some();
@@ -187,11 +177,8 @@ fn compare(
     } else {
         None
     };
-
-    let path = sources.path(frame.record.source);
-    let source = source_field(pack, path, &grid.name)?;
-    let of_source = trace::<f32>(&source, &scene).expect("the transform was inverted before");
-    let (a, b) = (of_source.to_rgb8(mode), of_pack.to_rgb8(mode));
+    let of_source = trace_source(pack, sources, [g, f], &scene)?;
+    let (a, b) = (of_source.to_rgb8(scene.mode), of_pack.to_rgb8(scene.mode));
     if let Some(folder) = &settings.images {
         let name = format!("{}-{:04}.png", file_name(&grid.name), frame.record.number);
         write_side_by_side(&folder.join(name), &a, &b)?;
@@ -202,6 +189,50 @@ fn compare(
         tracers,
         source: difference([SIDE; 2], &a, &b),
     }))
+}
+
+/// What the CPU tracer makes of a frame, and the scene it is in; `None` for one without a voxel.
+fn trace_pack(pack: &Pack, [g, f]: [usize; 2]) -> Result<Option<(Scene, Image)>> {
+    let (grid, frame) = (&pack.grids[g], &pack.grids[g].frames[f]);
+    let damaged = |e: &dyn std::fmt::Display| {
+        Error::Verify(format!("grid {:?} frame {}: {e}", grid.name, frame.record.number))
+    };
+    let packed = Field::from_pack(&pack.frame(g, f).map_err(|e| damaged(&e))?).map_err(|e| damaged(&e))?;
+    if packed.bounds.is_empty() {
+        return Ok(None);
+    }
+    let scene = Scene::new(grid, frame, packed.bounds, &View::default(), Mode::of_grid(grid), [SIDE; 2]);
+    let image = trace::<f32>(&packed, &scene).ok_or_else(|| damaged(&"its transform cannot be inverted"))?;
+    Ok(Some((scene, image)))
+}
+
+fn trace_source(pack: &Pack, sources: &Sources, [g, f]: [usize; 2], scene: &Scene) -> Result<Image> {
+    let grid = &pack.grids[g];
+    let path = sources.path(grid.frames[f].record.source);
+    let source = source_field(pack, path, &grid.name)?;
+    Ok(trace::<f32>(&source, scene).expect("the transform was inverted before"))
+}
+
+/// A frame as people see it, 8-bit RGB.
+#[derive(Clone, Debug)]
+pub struct Seen {
+    /// Pixels of a side.
+    pub side: u32,
+    /// The pack.
+    pub pack: Vec<u8>,
+    /// Its source, where that is at hand.
+    pub source: Option<Vec<u8>>,
+}
+
+/// Traces a frame of a grid on the CPU, with the picture ring's camera; `None` for one without a voxel.
+///
+/// # Errors
+/// When the source or a chunk of the pack cannot be read.
+pub fn look(pack: &Pack, sources: Option<&Sources>, place: [usize; 2]) -> Result<Option<Seen>> {
+    let Some((scene, of_pack)) = trace_pack(pack, place)? else { return Ok(None) };
+    let source = sources.map(|sources| trace_source(pack, sources, place, &scene)).transpose()?;
+    let source = source.map(|image| image.to_rgb8(scene.mode));
+    Ok(Some(Seen { side: SIDE, pack: of_pack.to_rgb8(scene.mode), source }))
 }
 
 fn source_field(pack: &Pack, path: &Path, grid: &str) -> Result<Field> {
@@ -230,7 +261,13 @@ fn file_name(grid: &str) -> String {
 }
 
 /// How much the difference is brightened.
-const DIFFERENCE_GAIN: u32 = 8;
+pub const DIFFERENCE_GAIN: u32 = 8;
+
+/// How far two pictures are apart, brightened.
+pub fn difference_map(a: &[u8], b: &[u8]) -> Vec<u8> {
+    let apart = |(a, b): (&u8, &u8)| (u32::from(a.abs_diff(*b)) * DIFFERENCE_GAIN).min(255) as u8;
+    a.iter().zip(b).map(apart).collect()
+}
 
 fn write_side_by_side(path: &Path, source: &[u8], pack: &[u8]) -> Result<()> {
     let stride = SIDE as usize * 3;
@@ -238,9 +275,7 @@ fn write_side_by_side(path: &Path, source: &[u8], pack: &[u8]) -> Result<()> {
     for (a, b) in source.chunks_exact(stride).zip(pack.chunks_exact(stride)) {
         out.extend_from_slice(a);
         out.extend_from_slice(b);
-        out.extend(
-            a.iter().zip(b).map(|(a, b)| (u32::from(a.abs_diff(*b)) * DIFFERENCE_GAIN).min(255) as u8),
-        );
+        out.extend(difference_map(a, b));
     }
     let file = std::fs::File::create(path).map_err(Error::io(path))?;
     write_png(std::io::BufWriter::new(file), [3 * SIDE, SIDE], &out).map_err(Error::io(path))

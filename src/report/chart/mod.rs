@@ -5,6 +5,7 @@
 
 use plotters::drawing::DrawingAreaErrorKind;
 
+mod asset;
 mod axis;
 mod labels;
 mod paint;
@@ -14,6 +15,7 @@ mod sweep;
 #[cfg(test)]
 mod tests;
 
+pub use asset::{Line, frames_svg, histogram_svg};
 pub use stability::stability_svg;
 pub use sweep::sweep_svg;
 

@@ -223,14 +223,14 @@ pub(super) fn heading(root: &Root, title: &str, subtitle: &str, how_to_read: &st
 
 /// Runs `draw` on an empty page and makes the result scale and speak to screen readers.
 pub(super) fn page(
-    height: u32,
+    [width, height]: [u32; 2],
     title: &str,
     description: &str,
     draw: impl FnOnce(&Root) -> Result<(), ChartError>,
 ) -> Result<String, ChartError> {
     let mut svg = String::new();
     {
-        let root = SVGBackend::with_string(&mut svg, (WIDTH, height)).into_drawing_area();
+        let root = SVGBackend::with_string(&mut svg, (width, height)).into_drawing_area();
         root.fill(&PAPER)?;
         draw(&root)?;
         root.present()?;
@@ -245,7 +245,7 @@ pub(super) fn page(
         |s: &str| s.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;");
     let (title, description) = (escape(title), escape(description));
     let mut out = format!(
-        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {WIDTH} {height}\" width=\"100%\" role=\"img\" \
+        "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width} {height}\" width=\"100%\" role=\"img\" \
          aria-label=\"{title}\">\n<title>{title}</title>\n<desc>{description}</desc>\n{body}"
     );
     // XML forbids these even when escaped.

@@ -149,7 +149,7 @@ pub fn stability_svg(volume: &str, subtitle: &str, spreads: &[Spread]) -> Result
          blockiness over repeated runs. Failing: {failing}.",
         spreads.len()
     );
-    page((bottom + 60 + 26 * WORDS.len() as i32) as u32, &title, &description, |root| {
+    page([WIDTH, (bottom + 60 + 26 * WORDS.len() as i32) as u32], &title, &description, |root| {
         let how = "Each bar runs from the smallest to the largest value seen over repeated runs. Arrows point to better.";
         heading(root, &title, subtitle, how)?;
         if spreads.is_empty() {

@@ -44,7 +44,7 @@ pub fn sweep_svg(volume: &str, subtitle: &str, points: &[Point]) -> Result<Strin
 
     let plural = if points.len() == 1 { "" } else { "s" };
     let title = format!("{volume}: quality against cost, {} setting{plural}", points.len());
-    page(height as u32, &title, &describe(&points), |root| {
+    page([WIDTH, height as u32], &title, &describe(&points), |root| {
         let how = "Each mark is one setting of one method. Higher is closer to the original, further left is cheaper.";
         heading(root, &title, subtitle, how)?;
         let plot = Plot { points: &points, looks: &looks, quality: &quality };

@@ -1,0 +1,331 @@
+//! `volpack report`.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use clap::{Args, ValueEnum};
+
+use super::cache::{CacheChoice, RemoteArgs};
+use super::jobs::assets;
+use super::progress::Reporter;
+use super::style::{ERROR, GOOD, TITLE};
+use super::{Common, outln};
+use crate::aside;
+use crate::cache::Cache;
+use crate::error::{Error, Result};
+use crate::manifest::{DEFAULT_NAME, Manifest, expand};
+use crate::pack::Pack;
+use crate::pipeline::{Job, Outcome, VerifyLevel, build, check_structure, verify_against};
+use crate::report::model::{AssetReport, BuildReport, Figures, Report, StageSeconds};
+use crate::report::{Baseline, Breach, Gallery, Reported, gallery, html, junit, markdown, schema};
+use crate::settings::Budget;
+use crate::stages::metadata::digest;
+use crate::sweep::cheaper;
+use crate::units::bytes;
+use crate::verify::{PictureSettings, Sources};
+
+#[derive(Args)]
+pub struct ReportArgs {
+    /// Finished packs, in place of a manifest's assets
+    #[arg(value_name = "PACKS", conflicts_with_all = ["manifest", "assets"])]
+    packs: Vec<PathBuf>,
+    /// The manifest: its assets are built, or taken from the cache
+    #[arg(short, long, value_name = "FILE", default_value = DEFAULT_NAME)]
+    manifest: PathBuf,
+    /// Only this asset of the manifest; may be given more than once
+    #[arg(long = "asset", value_name = "NAME")]
+    assets: Vec<String>,
+    /// With PACKS: the files that they were made from, to compare them with
+    #[arg(long, value_name = "FILES", num_args = 1.., requires = "packs")]
+    source: Vec<PathBuf>,
+    /// Write one page with pictures and charts
+    #[arg(long, value_name = "FILE")]
+    html: Option<PathBuf>,
+    /// Write every figure (volpack report --schema says what is in it)
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Write a table for a review comment
+    #[arg(long, value_name = "FILE")]
+    markdown: Option<PathBuf>,
+    /// Write test results as JUnit XML
+    #[arg(long, value_name = "FILE")]
+    junit: Option<PathBuf>,
+    /// The JSON of an older report: changes are told against it
+    #[arg(long, value_name = "FILE")]
+    baseline: Option<PathBuf>,
+    /// Leave out what the next cheaper setting would cost
+    #[arg(long)]
+    no_cheaper: bool,
+    /// How problems are printed
+    #[arg(long, value_name = "FORMAT", default_value = "text")]
+    format: Lines,
+    /// Print the JSON schema of --json and end
+    #[arg(long)]
+    schema: bool,
+    #[command(flatten)]
+    cache: CacheChoice,
+    #[command(flatten)]
+    remote: RemoteArgs,
+}
+
+/// How problems are printed.
+#[derive(Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Lines {
+    /// For people
+    Text,
+    /// As annotations of a GitHub runner
+    Github,
+}
+
+/// What becomes of assets, one after the other.
+struct Gathering<'a> {
+    args: &'a ReportArgs,
+    common: Common,
+    cache: Option<Arc<Cache>>,
+    baseline: Option<&'a Baseline>,
+    assets: Vec<AssetReport>,
+    breaches: Vec<Breach>,
+    galleries: BTreeMap<String, Gallery>,
+    failure: Option<Error>,
+}
+
+pub fn run(args: &ReportArgs, common: Common) -> Result<()> {
+    if args.schema {
+        super::print_json(&schema());
+        return Ok(());
+    }
+    let baseline = args.baseline.as_deref().map(Baseline::read).transpose()?;
+    let mut gathering = Gathering {
+        args,
+        common,
+        cache: args.cache.open_with(&args.remote),
+        baseline: baseline.as_ref(),
+        assets: Vec::new(),
+        breaches: Vec::new(),
+        galleries: BTreeMap::new(),
+        failure: None,
+    };
+    let mut budget = Budget::default();
+    if args.packs.is_empty() {
+        let chosen = assets(&args.manifest, &args.assets)?;
+        // Sums are limits of all assets, not of some.
+        if args.assets.is_empty() {
+            budget = Manifest::read(&args.manifest)?.budget;
+        }
+        for (name, asset) in chosen {
+            let limits = asset.budget;
+            gathering.add(&name, |gathering| {
+                let frames = expand(&asset.frames)?;
+                let mut job = Job::new(frames, asset.output, asset.settings, VerifyLevel::All);
+                job.pictures.max_flip = asset.max_flip;
+                job.cache = gathering.cache.clone();
+                job.paranoid = args.cache.paranoid;
+                gathering.build(&name, &job, &limits)
+            })?;
+        }
+    } else {
+        let sources = expand(&args.source)?;
+        for path in expand(&args.packs)? {
+            let name = path.file_stem().map_or_else(|| "pack".into(), |s| s.to_string_lossy().into_owned());
+            gathering.add(&name, |gathering| gathering.look(&name, &path, &sources))?;
+        }
+    }
+    gathering.finish(&budget)
+}
+
+impl Gathering<'_> {
+    /// Adds an asset. One that fails is reported too, and the others go on.
+    fn add(&mut self, name: &str, make: impl FnOnce(&mut Self) -> Result<AssetReport>) -> Result<()> {
+        let asset = match make(self) {
+            Ok(asset) => asset,
+            Err(Error::Interrupted) => return Err(Error::Interrupted),
+            Err(error) => {
+                let message = error.to_string();
+                self.failure.get_or_insert(error);
+                AssetReport { name: name.to_owned(), error: Some(message), pack: None, warnings: Vec::new() }
+            }
+        };
+        self.assets.push(asset);
+        Ok(())
+    }
+
+    /// Builds an asset and reports it.
+    fn build(&mut self, name: &str, job: &Job, limits: &Budget) -> Result<AssetReport> {
+        let mut reporter = Reporter::new(name, self.common.quiet);
+        let made = build(job, &mut reporter).and_then(|outcome| {
+            let refused = outcome.verification.as_ref().filter(|report| !report.ok);
+            if let Some(report) = refused {
+                return Err(Error::Verify(format!("verification failed: {}", report.failures.join("; "))));
+            }
+            let pack = Pack::open(&job.output).map_err(Error::pack(&job.output))?;
+            let figures = Figures::new(&outcome.summary, &pack, outcome.verification.as_ref(), None);
+            let cheaper = match self.args.no_cheaper {
+                true => None,
+                false => {
+                    reporter.finish();
+                    reporter = Reporter::new(&format!("{name}, cheaper"), self.common.quiet);
+                    cheaper(job, &figures, &mut reporter)?
+                }
+            };
+            Ok((outcome, pack, cheaper))
+        });
+        reporter.finish();
+        let (outcome, pack, cheaper) = made?;
+        let sources = Sources::find(&pack, &job.frames)?;
+        let Outcome { warnings, seconds, verification, made, was_verified, cache, .. } = outcome;
+        let stages = seconds.into_iter().map(|(stage, seconds)| StageSeconds { stage, seconds }).collect();
+        let reported = Reported {
+            name,
+            pack: &pack,
+            file: &job.output,
+            digest: digest(&job.output)?.0,
+            found: verification,
+            build: Some(BuildReport { made, was_verified, stages, cache }),
+            cheaper,
+            command: format!("volpack build -m {} --asset {name}", self.args.manifest.display()),
+            budget: limits,
+            baseline: self.baseline,
+        };
+        self.report(reported, Some(&sources), warnings)
+    }
+
+    /// Reports a pack that is there.
+    fn look(&mut self, name: &str, path: &Path, sources: &[PathBuf]) -> Result<AssetReport> {
+        let pack = check_structure(path)?;
+        let mut reporter = Reporter::new(name, self.common.quiet);
+        let files = (!sources.is_empty()).then_some(sources);
+        let pictures = PictureSettings::default();
+        let found =
+            files.map(|files| verify_against(&pack, files, Some(&pictures), &mut reporter)).transpose();
+        reporter.finish();
+        let found = found?;
+        if let Some(report) = found.as_ref().filter(|report| !report.ok) {
+            let message = format!("{}: {}", path.display(), report.failures.join("; "));
+            self.failure.get_or_insert(Error::Verify(message));
+        }
+        let sources = files.map(|files| Sources::find(&pack, files)).transpose()?;
+        let reported = Reported {
+            name,
+            pack: &pack,
+            file: path,
+            digest: digest(path)?.0,
+            found,
+            build: None,
+            cheaper: None,
+            command: format!("volpack verify {} --source FILES", path.display()),
+            budget: &Budget::default(),
+            baseline: self.baseline,
+        };
+        self.report(reported, sources.as_ref(), Vec::new())
+    }
+
+    fn report(
+        &mut self,
+        reported: Reported,
+        sources: Option<&Sources>,
+        warnings: Vec<String>,
+    ) -> Result<AssetReport> {
+        let name = reported.name.to_owned();
+        if self.args.html.is_some() {
+            let (pack, found) = (reported.pack, reported.found.as_ref());
+            let drawn = gallery(pack, reported.digest.as_bytes(), sources, found, self.cache.as_deref())?;
+            self.galleries.insert(name.clone(), drawn);
+        }
+        let failed = reported.found.as_ref().filter(|found| !found.ok).map(|found| found.failures.join("; "));
+        let (pack, breaches) = reported.report();
+        self.breaches.extend(breaches);
+        Ok(AssetReport { name, error: failed, pack: Some(pack), warnings })
+    }
+
+    /// Writes what was asked for, and says how it went.
+    fn finish(self, budget: &Budget) -> Result<()> {
+        let args = self.args;
+        let manifest = args.packs.is_empty().then(|| args.manifest.display().to_string());
+        let baseline = args.baseline.as_ref().map(|path| path.display().to_string());
+        let report = Report::new(self.assets, self.breaches, budget, manifest, baseline);
+        let other = |e: &dyn std::fmt::Display| Error::Other(format!("the report cannot be written: {e}"));
+        if let Some(path) = &args.json {
+            let mut json = serde_json::to_string_pretty(&report).map_err(|e| other(&e))?;
+            json.push('\n');
+            aside::write(path, json.as_bytes())?;
+        }
+        if let Some(path) = &args.markdown {
+            aside::write(path, markdown(&report).map_err(|e| other(&e))?.as_bytes())?;
+        }
+        if let Some(path) = &args.junit {
+            aside::write(path, junit(&report).map_err(|e| other(&e))?.as_bytes())?;
+        }
+        if let Some(path) = &args.html {
+            aside::write(path, html(&report, &self.galleries).map_err(|e| other(&e))?.as_bytes())?;
+        }
+        if let Some(cache) = &self.cache {
+            super::cache::finish(cache, self.common.quiet);
+        }
+        if !self.common.quiet {
+            print(&report);
+        }
+        if args.format == Lines::Github {
+            annotate(&report);
+        }
+        if let Some(failure) = self.failure {
+            return Err(failure);
+        }
+        match report.breaches.is_empty() {
+            true => Ok(()),
+            false => Err(over_budget(&report.breaches)),
+        }
+    }
+}
+
+/// What a build that is past its limits ends with.
+pub fn over_budget(breaches: &[Breach]) -> Error {
+    Error::Budget(breaches.iter().map(|breach| format!("\n  {breach}")).collect())
+}
+
+fn print(report: &Report) {
+    for asset in &report.assets {
+        let name = &asset.name;
+        match &asset.pack {
+            None => outln!("{TITLE}{name}{TITLE:#}: {ERROR}not built{ERROR:#}"),
+            Some(pack) => {
+                let figures = &pack.figures;
+                let quality =
+                    if figures.compared { crate::units::psnr(figures.psnr) } else { "not compared".into() };
+                let (gpu, file) = (bytes(figures.gpu_bytes), bytes(figures.file_bytes));
+                outln!("{TITLE}{name}{TITLE:#}: {gpu} on the GPU, file {file}, {quality}");
+            }
+        }
+    }
+    let total = &report.total;
+    let verdict = if report.ok { format!("{GOOD}ok{GOOD:#}") } else { format!("{ERROR}not ok{ERROR:#}") };
+    let count = report.assets.len();
+    outln!(
+        "{count} assets, {} on the GPU, files {}: {verdict}",
+        bytes(total.gpu_bytes),
+        bytes(total.file_bytes)
+    );
+}
+
+/// What a GitHub runner shows beside a change.
+fn annotate(report: &Report) {
+    // The runner's own escapes for messages, and those for properties.
+    let message = |text: &str| text.replace('%', "%25").replace('\r', "%0D").replace('\n', "%0A");
+    let title = |text: &str| message(text).replace(':', "%3A").replace(',', "%2C");
+    for asset in &report.assets {
+        if let Some(error) = &asset.error {
+            outln!("::error title={}::{}", title(&asset.name), message(error));
+        }
+        for warning in &asset.warnings {
+            outln!("::warning title={}::{}", title(&asset.name), message(warning));
+        }
+    }
+    for breach in &report.breaches {
+        let name = format!("{} over {}", breach.asset.as_deref().unwrap_or("all assets"), breach.budget);
+        outln!(
+            "::error title={}::{}",
+            title(&name),
+            message(&format!("{}; {}", breach.message, breach.remedy))
+        );
+    }
+}
