@@ -69,7 +69,7 @@ fn json_is_as_its_schema_says_and_the_schema_is_documented() {
 
     assert_eq!(json["assets"][1]["name"], "puff");
     let puff = &json["assets"][1]["pack"];
-    assert!(puff["cheaper"]["gpu_bytes"].as_u64() < puff["figures"]["gpu_bytes"].as_u64());
+    assert!(puff["cheaper"]["figures"]["gpu_bytes"].as_u64() < puff["figures"]["gpu_bytes"].as_u64());
     assert_eq!(puff["cheaper"]["setting"], "psnr = 42");
     let bins: u64 = puff["verification"]["grids"][0]["histogram"]
         .as_array()
@@ -89,8 +89,9 @@ fn json_is_as_its_schema_says_and_the_schema_is_documented() {
 #[test]
 fn every_limit_that_is_past_is_told_with_what_would_meet_it() {
     let cases = [
-        ("gpu_size = '1kB'", "puff: gpu_size: ", "size = 1000 would meet it, in place of psnr"),
-        ("file_size = '7kB'", "puff: file_size: ", " on the GPU should meet it, in place of psnr"),
+        ("gpu_size = '1kB'", "puff: gpu_size: ", "no size would meet it: tree and masks are 7.6"),
+        ("gpu_size = '12kB'", "puff: gpu_size: ", "size = 12000 should meet it, in place of psnr"),
+        ("file_size = '7kB'", "puff: file_size: ", " should meet it, in place of psnr"),
         ("tree_share = '1%'", "puff: tree_share: ", "a larger tree_share"),
         ("min_psnr = 50", "puff: min_psnr: 4", "dB are under 50 dB; psnr = 50 would meet it"),
         ("max_error = '0.1%'", "puff: max_error: ", "max_error = \"0.001\" would meet it, in place of psnr"),
@@ -130,8 +131,7 @@ fn what_is_said_to_meet_a_limit_meets_it() {
         let (code, json, said) = report(folder.path(), &["--asset", "puff"]);
         assert_eq!(code, 5, "{limit}: {said}");
         let remedy = json["breaches"][0]["remedy"].as_str().unwrap();
-        let end =
-            [" on the GPU", " should", " would"].iter().filter_map(|end| remedy.find(end)).min().unwrap();
+        let end = [" should", " would"].iter().filter_map(|end| remedy.find(end)).min().unwrap();
         write_manifest(folder.path(), "", &remedy[..end], limit);
         let (code, _, said) = report(folder.path(), &["--asset", "puff"]);
         assert_eq!(code, 0, "{limit} with {remedy}: {said}");
@@ -195,7 +195,7 @@ fn one_bad_asset_is_reported_among_the_others() {
     assert!(said.starts_with("::error title=a|b <i>::none_*.vdb: no file matches\n"), "{said}");
     let read = |name: &str| fs::read_to_string(folder.path().join(name)).unwrap();
     let (html, markdown, junit) = (read("out/r.html"), read("r.md"), read("r.xml"));
-    assert!(markdown.contains("| ❌ a\\|b \\<i\\> | not built |"), "{markdown}");
+    assert!(markdown.contains("| ❌ a\\|b &lt;i\\> | not built |"), "{markdown}");
     assert!(html.contains("a|b &#60;i&#62;") && !html.contains("a|b <i>"));
     assert!(junit.contains("errors=\"1\"") && junit.contains("none_*.vdb: no file matches"), "{junit}");
     for text in [html, markdown, junit] {
@@ -204,14 +204,53 @@ fn one_bad_asset_is_reported_among_the_others() {
 }
 
 #[test]
+fn a_cheaper_setting_that_cannot_be_reached_fails_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    // The least that can be reached, as the error for less names it.
+    write_manifest(folder.path(), "", "size = 1", "");
+    let output = volpack(folder.path(), &["build", "-q", "--asset", "puff"]);
+    let said = String::from_utf8(output.stderr).unwrap();
+    let least = said.split_once("the least is ").and_then(|(_, rest)| rest.split_once(':')).unwrap().0;
+    write_manifest(folder.path(), "", &format!("size = {least}"), "");
+    let output = volpack(folder.path(), &["report", "--json", "r.json", "-q", "--asset", "puff"]);
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert_eq!((output.status.code(), &*said), (Some(0), ""));
+    let json: Json = serde_json::from_slice(&fs::read(folder.path().join("r.json")).unwrap()).unwrap();
+    assert!(json["assets"][0]["pack"]["cheaper"].is_null() && json["ok"] == true);
+}
+
+#[test]
+fn what_fails_does_not_hide_what_is_over_budget() {
+    let folder = shop("", "min_psnr = 50");
+    let manifest = fs::read_to_string(folder.path().join("pipeline.toml")).unwrap();
+    let more = "[asset.x]\nframes = 'none_*.vdb'\n[asset.y]\nframes = 'nor_*.vdb'\n";
+    fs::write(folder.path().join("pipeline.toml"), manifest + more).unwrap();
+    for args in [&["build", "-q"][..], &["report", "-q", "--no-cheaper"]] {
+        let output = volpack(folder.path(), args);
+        let said = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(3), "{said}");
+        for line in ["none_*.vdb: no file matches", "nor_*.vdb: no file matches", "puff: min_psnr: "] {
+            assert!(said.matches(line).count() == 1, "{said}");
+        }
+    }
+}
+
+#[test]
 fn finished_packs_are_reported_with_and_without_their_sources() {
     let folder = shop("", "");
     assert!(volpack(folder.path(), &["build", "-q"]).status.success());
-    let (code, json, said) = report(folder.path(), &["ball.volpack", "puff.volpack", "--html", "r.html"]);
+    fs::create_dir(folder.path().join("other")).unwrap();
+    fs::copy(folder.path().join("puff.volpack"), folder.path().join("other/ball.volpack")).unwrap();
+    let packs = ["ball.volpack", "puff.volpack", "other/ball.volpack", "--html", "r.html"];
+    let (code, json, said) = report(folder.path(), &packs);
     assert_eq!(code, 0, "{said}");
+    assert_eq!(
+        (&json["assets"][0]["name"], &json["assets"][2]["name"]),
+        (&"ball".into(), &"other/ball".into())
+    );
     assert_eq!(json["assets"][0]["pack"]["figures"]["compared"], false);
     let html = fs::read_to_string(folder.path().join("r.html")).unwrap();
-    assert!(html.contains("2 were not compared with their sources") && html.contains("not compared"));
+    assert!(html.contains("3 were not compared with their sources") && html.contains("not compared"));
     let source = fixture("levelset_half.vdb");
     let (code, json, said) = report(folder.path(), &["ball.volpack", "--source", source.to_str().unwrap()]);
     assert_eq!((code, &json["assets"][0]["pack"]["figures"]["compared"]), (0, &true.into()), "{said}");

@@ -5,7 +5,7 @@ use std::io::{self, Read, Write};
 use std::path::Path;
 
 use super::writer::Content;
-use super::{Blob, Cache, Key, Map, tiers};
+use super::{Blob, Cache, Key, Map};
 
 /// Bytes that are copied and hashed at a time: enough for BLAKE3 to use its widest lanes.
 const PIECE: usize = 1 << 20;
@@ -17,9 +17,7 @@ impl Cache {
     /// # Errors
     /// When the file cannot be opened.
     pub fn put_file(&self, key: &Key, path: &Path, blob: Blob) -> io::Result<()> {
-        self.upload(key, Map::Blobs, blob.digest, || {
-            tiers::may_travel(&blob).then(|| std::fs::read(path).ok())?
-        });
+        self.upload(key, &blob, Map::Blobs, || std::fs::read(path).ok());
         self.keep(key, blob, Content::File(File::open(path)?));
         Ok(())
     }

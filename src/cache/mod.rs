@@ -120,14 +120,14 @@ impl Cache {
     pub fn put<T: Serialize>(&self, key: &Key, value: &T) {
         let bytes = artefact::encode(value);
         let blob = Blob { digest: blake3::hash(&bytes).into(), bytes: bytes.len() as u64 };
-        self.upload(key, Map::Blobs, blob.digest, || Some(bytes.clone()));
+        self.upload(key, &blob, Map::Blobs, || Some(bytes.clone()));
         self.keep(key, blob, Content::Bytes(bytes));
     }
 
     /// Lets a key stand for a result that is kept under another already.
     pub fn put_alias(&self, key: &Key, blob: Blob) {
         let entry = Entry::new(key, blob).to_bytes();
-        self.upload(key, Map::Actions, *key.digest(), || Some(entry.clone()));
+        self.upload(key, &blob, Map::Actions, || Some(entry.clone()));
         self.writer.write(Map::Actions, *key.digest(), Content::Bytes(entry));
     }
 

@@ -16,7 +16,7 @@ const GROUP: u64 = 64 << 20;
 const UPLOADS_MAY_TAKE: Duration = Duration::from_secs(30);
 
 /// Whether a blob is small enough for a remote.
-pub(super) fn may_travel(blob: &Blob) -> bool {
+fn may_travel(blob: &Blob) -> bool {
     blob.bytes <= MOST
 }
 
@@ -35,6 +35,7 @@ impl Cache {
         }
         let (known, unknown): (Vec<_>, Vec<_>) = keys
             .into_iter()
+            .filter(Key::travels)
             .map(|key| (key, self.checked(self.store.read_action(&key))))
             .partition(|(_, e)| e.is_some());
         let unknown: Vec<Key> = unknown.into_iter().map(|(key, _)| key).collect();
@@ -55,9 +56,9 @@ impl Cache {
         }
     }
 
-    /// Waits for uploads, but not forever, and tells now and then how many are left. Gives what is to be told since the
-    /// last time.
-    pub fn finish(&self, left: impl FnMut(u64)) -> Vec<String> {
+    /// Waits for uploads, but not forever: tells now and then how many are left, and goes on while the answer is true.
+    /// Gives what is to be told since the last time.
+    pub fn finish(&self, left: impl FnMut(u64) -> bool) -> Vec<String> {
         self.remote.as_ref().map(|remote| remote.finish(UPLOADS_MAY_TAKE, left)).unwrap_or_default()
     }
 
@@ -128,17 +129,13 @@ impl Cache {
         names.par_iter().zip(&asked).zip(answers).filter_map(keep).collect()
     }
 
-    /// Sends an entry of a key to the remote, if it takes any.
-    pub(super) fn upload(
-        &self,
-        key: &Key,
-        map: Map,
-        digest: [u8; 32],
-        bytes: impl FnOnce() -> Option<Vec<u8>>,
-    ) {
-        if let Some(remote) = self.remote.as_ref().filter(|remote| key.travels() && remote.is_written())
+    /// Sends a part of an entry to the remote, if that takes any: the action, or the blob.
+    pub(super) fn upload(&self, key: &Key, blob: &Blob, map: Map, bytes: impl FnOnce() -> Option<Vec<u8>>) {
+        let is_wanted = |remote: &&Remote| key.travels() && may_travel(blob) && remote.is_written();
+        if let Some(remote) = self.remote.as_ref().filter(is_wanted)
             && let Some(bytes) = bytes()
         {
+            let digest = if map == Map::Actions { *key.digest() } else { blob.digest };
             remote.put(map, digest, bytes);
         }
     }

@@ -53,18 +53,14 @@ pub fn run(args: &BuildArgs, common: Common) -> Result<()> {
         assets.push(asset);
     }
     if let Some(cache) = cache.filter(|_| !matches!(failure, Some(Error::Interrupted))) {
-        super::cache::finish(&cache, common.quiet || args.json);
+        super::cache::finish(&cache, common.quiet || args.json)?;
     }
     let packs: Vec<(&str, &Figures)> = built.iter().map(|(name, figures)| (&**name, figures)).collect();
     breaches.extend(of_total(&Total::new(&packs, &all), &packs));
     if args.json {
         print_json(&json!({ "assets": assets, "breaches": breaches }));
     }
-    match failure {
-        Some(failure) => Err(failure),
-        None if breaches.is_empty() => Ok(()),
-        None => Err(super::report::over_budget(&breaches)),
-    }
+    super::report::end(failure, &breaches)
 }
 
 /// A pack's figures; adds every limit that it is past.
@@ -77,14 +73,10 @@ fn check(
 ) -> Result<Figures> {
     let pack = Pack::open(&job.output).map_err(Error::pack(&job.output))?;
     let found = outcome.verification.as_ref();
-    let seconds = |stage: Option<&str>| {
-        let of_stage = outcome.seconds.iter().filter(|(name, _)| stage.is_none_or(|stage| stage == *name));
-        of_stage.map(|(_, seconds)| seconds).sum()
-    };
-    let figures = Figures::new(&outcome.summary, &pack, found, Some(seconds(None)));
-    let verify_seconds = seconds(Some("verify"));
-    let checked =
-        Checked { name, budget, figures: &figures, baseline: None, pack: &pack, found, verify_seconds };
+    let build = outcome.build_report();
+    let figures = Figures::new(&pack, &outcome.summary, found, Some(&build));
+    let build = Some(&build);
+    let checked = Checked { name, budget, figures: &figures, baseline: None, pack: &pack, found, build };
     breaches.extend(checked.breaches());
     Ok(figures)
 }

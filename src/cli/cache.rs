@@ -13,6 +13,7 @@ use super::{Common, outln, print_json};
 use crate::cache::Cache;
 use crate::cache::remote::{Policy, Remote};
 use crate::error::{Error, Result};
+use crate::interrupt;
 use crate::pipeline::Progress;
 use crate::settings::ByteSize;
 use crate::units::{bytes, count};
@@ -96,8 +97,8 @@ fn warn(warning: &str) {
     anstream::eprintln!("{WARNING}warning{WARNING:#}: {warning}");
 }
 
-/// Waits for what is on its way to a remote.
-pub fn finish(cache: &Cache, quiet: bool) {
+/// Waits for what is on its way to a remote, unless the user has enough.
+pub fn finish(cache: &Cache, quiet: bool) -> Result<()> {
     let mut reporter = Reporter::new("cache", quiet);
     let all = cache.waiting();
     if all > 0 {
@@ -108,9 +109,11 @@ pub fn finish(cache: &Cache, quiet: bool) {
         let now = all.saturating_sub(left);
         reporter.advance(now.saturating_sub(sent));
         sent = now.max(sent);
+        !interrupt::is_requested()
     });
     warnings.iter().for_each(|warning| reporter.warn(warning));
     reporter.finish();
+    interrupt::check()
 }
 
 #[derive(Args)]

@@ -30,7 +30,7 @@ pub struct ExplainArgs {
 pub fn run(args: &ExplainArgs) -> Result<()> {
     let cache = args.cache.open();
     let mut out = Vec::new();
-    for (name, asset) in assets(&args.manifest, &args.assets)? {
+    for (name, asset) in assets(&args.manifest, &args.assets)?.0 {
         let mut job = Job::new(expand(&asset.frames)?, asset.output, asset.settings, VerifyLevel::All);
         job.pictures.max_flip = asset.max_flip;
         job.cache = cache.clone();

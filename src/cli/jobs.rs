@@ -47,17 +47,13 @@ impl JobArgs {
         self.cache.open_with(&self.remote)
     }
 
-    /// What all assets together may cost, and what each that is asked for has to keep, by name. Sums are limits of all
-    /// assets, not of some.
+    /// What all assets together may cost, and what each that is asked for has to keep, by name.
     pub fn budgets(&self) -> Result<(Budget, BTreeMap<String, Budget>)> {
         if !self.frames.is_empty() {
             return Ok(Default::default());
         }
-        let each =
-            assets(&self.manifest, &self.assets)?.into_iter().map(|(name, asset)| (name, asset.budget));
-        let all =
-            if self.assets.is_empty() { Manifest::read(&self.manifest)?.budget } else { Budget::default() };
-        Ok((all, each.collect()))
+        let (assets, all) = assets(&self.manifest, &self.assets)?;
+        Ok((all, assets.into_iter().map(|(name, asset)| (name, asset.budget)).collect()))
     }
 
     /// The packs that are asked for, with the names to show, checked as `verify` says where nothing is said.
@@ -82,7 +78,7 @@ impl JobArgs {
                 .output
                 .as_deref()
                 .ok_or_else(|| Error::Usage("FILES need a pack to go into: add -o OUT.volpack".to_owned()))?;
-            let name = output.file_stem().map_or_else(|| "pack".into(), |s| s.to_string_lossy().into_owned());
+            let name = stem(output);
             let settings = self.settings.settings()?;
             return Ok(vec![(name, expand(&self.frames).map(|f| job(f, output, settings, None)))]);
         }
@@ -91,7 +87,7 @@ impl JobArgs {
                 "-o and the settings of a pack go with FILES; for a manifest they stand in it".to_owned(),
             ));
         }
-        let assets = assets(&self.manifest, &self.assets)?;
+        let (assets, _) = assets(&self.manifest, &self.assets)?;
         let of_asset = |(name, asset): (String, Asset)| {
             let frames = expand(&asset.frames);
             (name, frames.map(|frames| job(frames, &asset.output, asset.settings, asset.max_flip)))
@@ -100,8 +96,14 @@ impl JobArgs {
     }
 }
 
-/// Some assets of a manifest, or all of them where none are named.
-pub fn assets(path: &Path, names: &[String]) -> Result<Vec<(String, Asset)>> {
+/// What a pack is called after its file.
+pub fn stem(path: &Path) -> String {
+    path.file_stem().map_or_else(|| "pack".into(), |s| s.to_string_lossy().into_owned())
+}
+
+/// Some assets of a manifest, or all of them where none are named, and what all of them together may cost: nothing is
+/// said of some.
+pub fn assets(path: &Path, names: &[String]) -> Result<(Vec<(String, Asset)>, Budget)> {
     if !path.exists() {
         return Err(Error::Usage(format!(
             "there is no manifest {}: name one with -m, or give files: volpack build FILES... -o OUT.volpack",
@@ -109,6 +111,7 @@ pub fn assets(path: &Path, names: &[String]) -> Result<Vec<(String, Asset)>> {
         )));
     }
     let manifest = Manifest::read(path)?;
+    let budget = if names.is_empty() { manifest.budget } else { Budget::default() };
     let names: Vec<&String> =
         if names.is_empty() { manifest.assets.keys().collect() } else { names.iter().collect() };
     if names.is_empty() {
@@ -129,5 +132,5 @@ pub fn assets(path: &Path, names: &[String]) -> Result<Vec<(String, Asset)>> {
         }
         assets.push((name.clone(), asset.clone()));
     }
-    Ok(assets)
+    Ok((assets, budget))
 }

@@ -1,29 +1,28 @@
 //! `volpack report`.
 
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clap::{Args, ValueEnum};
 
 use super::cache::{CacheChoice, RemoteArgs};
-use super::jobs::assets;
+use super::jobs::{assets, stem};
 use super::progress::Reporter;
 use super::style::{ERROR, GOOD, TITLE};
 use super::{Common, outln};
 use crate::aside;
 use crate::cache::Cache;
 use crate::error::{Error, Result};
-use crate::manifest::{DEFAULT_NAME, Manifest, expand};
+use crate::manifest::{DEFAULT_NAME, expand};
 use crate::pack::Pack;
 use crate::pipeline::{Job, Outcome, VerifyLevel, build, check_structure, verify_against};
-use crate::report::model::{AssetReport, BuildReport, Figures, Report, StageSeconds};
+use crate::report::model::{AssetReport, Figures, Report};
 use crate::report::{Baseline, Breach, Gallery, Reported, gallery, html, junit, markdown, schema};
 use crate::settings::Budget;
 use crate::stages::metadata::digest;
 use crate::sweep::cheaper;
 use crate::units::bytes;
-use crate::verify::{PictureSettings, Sources};
+use crate::verify::PictureSettings;
 
 #[derive(Args)]
 pub struct ReportArgs {
@@ -86,7 +85,8 @@ struct Gathering<'a> {
     baseline: Option<&'a Baseline>,
     assets: Vec<AssetReport>,
     breaches: Vec<Breach>,
-    galleries: BTreeMap<String, Gallery>,
+    /// One for each asset.
+    galleries: Vec<Option<Gallery>>,
     failure: Option<Error>,
 }
 
@@ -103,16 +103,13 @@ pub fn run(args: &ReportArgs, common: Common) -> Result<()> {
         baseline: baseline.as_ref(),
         assets: Vec::new(),
         breaches: Vec::new(),
-        galleries: BTreeMap::new(),
+        galleries: Vec::new(),
         failure: None,
     };
     let mut budget = Budget::default();
     if args.packs.is_empty() {
-        let chosen = assets(&args.manifest, &args.assets)?;
-        // Sums are limits of all assets, not of some.
-        if args.assets.is_empty() {
-            budget = Manifest::read(&args.manifest)?.budget;
-        }
+        let (chosen, all) = assets(&args.manifest, &args.assets)?;
+        budget = all;
         for (name, asset) in chosen {
             let limits = asset.budget;
             gathering.add(&name, |gathering| {
@@ -126,9 +123,12 @@ pub fn run(args: &ReportArgs, common: Common) -> Result<()> {
         }
     } else {
         let sources = expand(&args.source)?;
-        for path in expand(&args.packs)? {
-            let name = path.file_stem().map_or_else(|| "pack".into(), |s| s.to_string_lossy().into_owned());
-            gathering.add(&name, |gathering| gathering.look(&name, &path, &sources))?;
+        let packs = expand(&args.packs)?;
+        for path in &packs {
+            // Two of one name are told apart by their folders.
+            let is_alone = packs.iter().filter(|other| stem(other) == stem(path)).count() == 1;
+            let name = if is_alone { stem(path) } else { path.with_extension("").display().to_string() };
+            gathering.add(&name, |gathering| gathering.look(&name, path, &sources))?;
         }
     }
     gathering.finish(&budget)
@@ -142,12 +142,19 @@ impl Gathering<'_> {
             Err(Error::Interrupted) => return Err(Error::Interrupted),
             Err(error) => {
                 let message = error.to_string();
-                self.failure.get_or_insert(error);
+                self.fail(error);
                 AssetReport { name: name.to_owned(), error: Some(message), pack: None, warnings: Vec::new() }
             }
         };
+        // Those that were made stand at their assets' places.
+        self.galleries.resize_with(self.assets.len() + 1, || None);
         self.assets.push(asset);
         Ok(())
+    }
+
+    /// All errors are printed, the last by the caller.
+    fn fail(&mut self, error: Error) {
+        self.failure.replace(error).iter().for_each(super::print_error);
     }
 
     /// Builds an asset and reports it.
@@ -159,35 +166,44 @@ impl Gathering<'_> {
                 return Err(Error::Verify(format!("verification failed: {}", report.failures.join("; "))));
             }
             let pack = Pack::open(&job.output).map_err(Error::pack(&job.output))?;
-            let figures = Figures::new(&outcome.summary, &pack, outcome.verification.as_ref(), None);
-            let cheaper = match self.args.no_cheaper {
-                true => None,
-                false => {
-                    reporter.finish();
-                    reporter = Reporter::new(&format!("{name}, cheaper"), self.common.quiet);
-                    cheaper(job, &figures, &mut reporter)?
+            let figures = Figures::new(&pack, &outcome.summary, outcome.verification.as_ref(), None);
+            if self.args.no_cheaper {
+                return Ok((outcome, pack, None, None));
+            }
+            reporter.finish();
+            reporter = Reporter::new(&format!("{name}, cheaper"), self.common.quiet);
+            match cheaper(job, &figures, &mut reporter) {
+                Ok(cheaper) => Ok((outcome, pack, cheaper, None)),
+                Err(Error::Interrupted) => Err(Error::Interrupted),
+                // A size that cannot be reached is no offer.
+                Err(Error::Usage(_)) => Ok((outcome, pack, None, None)),
+                Err(error) => {
+                    Ok((outcome, pack, None, Some(format!("no cheaper setting was measured: {error}"))))
                 }
-            };
-            Ok((outcome, pack, cheaper))
+            }
         });
         reporter.finish();
-        let (outcome, pack, cheaper) = made?;
-        let sources = Sources::find(&pack, &job.frames)?;
-        let Outcome { warnings, seconds, verification, made, was_verified, cache, .. } = outcome;
-        let stages = seconds.into_iter().map(|(stage, seconds)| StageSeconds { stage, seconds }).collect();
+        let (outcome, pack, cheaper, trouble) = made?;
+        let build = outcome.build_report();
+        let Outcome { mut warnings, verification, .. } = outcome;
+        warnings.extend(trouble);
         let reported = Reported {
             name,
             pack: &pack,
             file: &job.output,
             digest: digest(&job.output)?.0,
             found: verification,
-            build: Some(BuildReport { made, was_verified, stages, cache }),
+            build: Some(build),
             cheaper,
-            command: format!("volpack build -m {} --asset {name}", self.args.manifest.display()),
+            command: format!(
+                "volpack build -m {} --asset {}",
+                quoted(&self.args.manifest.to_string_lossy()),
+                quoted(name)
+            ),
             budget: limits,
             baseline: self.baseline,
         };
-        self.report(reported, Some(&sources), warnings)
+        self.report(reported, Some(&job.frames), warnings)
     }
 
     /// Reports a pack that is there.
@@ -202,9 +218,8 @@ impl Gathering<'_> {
         let found = found?;
         if let Some(report) = found.as_ref().filter(|report| !report.ok) {
             let message = format!("{}: {}", path.display(), report.failures.join("; "));
-            self.failure.get_or_insert(Error::Verify(message));
+            self.fail(Error::Verify(message));
         }
-        let sources = files.map(|files| Sources::find(&pack, files)).transpose()?;
         let reported = Reported {
             name,
             pack: &pack,
@@ -213,26 +228,29 @@ impl Gathering<'_> {
             found,
             build: None,
             cheaper: None,
-            command: format!("volpack verify {} --source FILES", path.display()),
+            command: format!("volpack verify {} --source FILES", quoted(&path.to_string_lossy())),
             budget: &Budget::default(),
             baseline: self.baseline,
         };
-        self.report(reported, sources.as_ref(), Vec::new())
+        self.report(reported, files, Vec::new())
     }
 
     fn report(
         &mut self,
         reported: Reported,
-        sources: Option<&Sources>,
-        warnings: Vec<String>,
+        files: Option<&[PathBuf]>,
+        mut warnings: Vec<String>,
     ) -> Result<AssetReport> {
         let name = reported.name.to_owned();
+        let (pack, found) = (reported.pack, reported.found.as_ref());
         if self.args.html.is_some() {
-            let (pack, found) = (reported.pack, reported.found.as_ref());
-            let drawn = gallery(pack, reported.digest.as_bytes(), sources, found, self.cache.as_deref())?;
-            self.galleries.insert(name.clone(), drawn);
+            let drawn = gallery(pack, reported.digest.as_bytes(), files, found, self.cache.as_deref())?;
+            self.galleries.push(Some(drawn));
         }
-        let failed = reported.found.as_ref().filter(|found| !found.ok).map(|found| found.failures.join("; "));
+        if self.baseline.is_some_and(|baseline| baseline.figures(&name).is_none()) {
+            warnings.push("the baseline has no asset of this name".to_owned());
+        }
+        let failed = found.filter(|found| !found.ok).map(|found| found.failures.join("; "));
         let (pack, breaches) = reported.report();
         self.breaches.extend(breaches);
         Ok(AssetReport { name, error: failed, pack: Some(pack), warnings })
@@ -260,7 +278,7 @@ impl Gathering<'_> {
             aside::write(path, html(&report, &self.galleries).map_err(|e| other(&e))?.as_bytes())?;
         }
         if let Some(cache) = &self.cache {
-            super::cache::finish(cache, self.common.quiet);
+            super::cache::finish(cache, self.common.quiet)?;
         }
         if !self.common.quiet {
             print(&report);
@@ -268,19 +286,28 @@ impl Gathering<'_> {
         if args.format == Lines::Github {
             annotate(&report);
         }
-        if let Some(failure) = self.failure {
-            return Err(failure);
-        }
-        match report.breaches.is_empty() {
-            true => Ok(()),
-            false => Err(over_budget(&report.breaches)),
-        }
+        end(self.failure, &report.breaches)
     }
 }
 
-/// What a build that is past its limits ends with.
-pub fn over_budget(breaches: &[Breach]) -> Error {
-    Error::Budget(breaches.iter().map(|breach| format!("\n  {breach}")).collect())
+/// How a command ends with assets that failed and limits that are past: all is told, the last by the caller.
+pub fn end(failure: Option<Error>, breaches: &[Breach]) -> Result<()> {
+    let lines: String = breaches.iter().map(|breach| format!("\n  {breach}")).collect();
+    let over = (!breaches.is_empty()).then_some(Error::Budget(lines));
+    match (failure, over) {
+        (Some(failure), over) => {
+            over.iter().for_each(super::print_error);
+            Err(failure)
+        }
+        (None, Some(over)) => Err(over),
+        (None, None) => Ok(()),
+    }
+}
+
+/// A name as a shell takes it.
+fn quoted(text: &str) -> String {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "._-/".contains(c);
+    if text.chars().all(is_plain) { text.to_owned() } else { format!("'{}'", text.replace('\'', "'\\''")) }
 }
 
 fn print(report: &Report) {
@@ -290,8 +317,7 @@ fn print(report: &Report) {
             None => outln!("{TITLE}{name}{TITLE:#}: {ERROR}not built{ERROR:#}"),
             Some(pack) => {
                 let figures = &pack.figures;
-                let quality =
-                    if figures.compared { crate::units::psnr(figures.psnr) } else { "not compared".into() };
+                let quality = figures.decibels(figures.psnr);
                 let (gpu, file) = (bytes(figures.gpu_bytes), bytes(figures.file_bytes));
                 outln!("{TITLE}{name}{TITLE:#}: {gpu} on the GPU, file {file}, {quality}");
             }

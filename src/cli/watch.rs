@@ -75,6 +75,9 @@ pub fn run(args: &WatchArgs, common: Common) -> Result<()> {
         }
         std::thread::sleep(LOOK_EVERY);
     }
+    // Ctrl-C is how it ends: what is on its way by then is told, not waited for.
+    let lost = cache.iter().flat_map(|cache| cache.finish(|_| false));
+    lost.for_each(|warning| anstream::eprintln!("{WARNING}warning{WARNING:#}: {warning}"));
     Ok(())
 }
 

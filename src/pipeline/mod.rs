@@ -17,6 +17,7 @@ use crate::error::{Error, Result};
 use crate::pack::{FinishedPack, Pack, Provenance, Source};
 use crate::report::PackSummary;
 pub use crate::report::model::Made;
+use crate::report::model::{BuildReport, StageSeconds};
 use crate::settings::{Format, NOT_WITH_ADAPTIVE, Settings};
 use crate::stages::metadata::{self, Digests, SequenceInfo};
 use crate::stages::quantise::QuantiseError;
@@ -101,6 +102,15 @@ pub struct Outcome {
     pub was_verified: bool,
     /// How often each stage's results were found in the cache, and how often not.
     pub cache: BTreeMap<&'static str, Uses>,
+}
+
+impl Outcome {
+    /// How the pack came to be.
+    pub fn build_report(&self) -> BuildReport {
+        let stages = self.seconds.iter().map(|&(stage, seconds)| StageSeconds { stage, seconds });
+        let (made, was_verified) = (self.made, self.was_verified);
+        BuildReport { made, was_verified, stages: stages.collect(), cache: self.cache.clone() }
+    }
 }
 
 /// Builds one pack, and verifies it as the job asks.

@@ -3,9 +3,9 @@
 use schemars::JsonSchema;
 use serde::Serialize;
 
-use super::model::{Figures, Total};
+use super::model::{BuildReport, Figures, Total};
 use crate::pack::Pack;
-use crate::settings::{Budget, Format, Masks, Quality};
+use crate::settings::{Budget, ErrorBound, Format, Masks, Quality};
 use crate::units::{bytes, seconds};
 use crate::vdb::voxel_size;
 use crate::verify::VerifyReport;
@@ -19,8 +19,8 @@ pub struct Breach {
     pub budget: &'static str,
     /// What is; null where it was not measured.
     pub figure: Option<f64>,
-    /// What may be.
-    pub limit: f64,
+    /// What may be; null where that has the unit of a grid that was not measured.
+    pub limit: Option<f64>,
     /// Both, for people.
     pub message: String,
     /// What would meet it.
@@ -51,28 +51,47 @@ pub struct Checked<'a> {
     pub pack: &'a Pack,
     /// What was found of it.
     pub found: Option<&'a VerifyReport>,
-    /// What verification took of the build's seconds.
-    pub verify_seconds: f64,
+    /// How it came to be.
+    pub build: Option<&'a BuildReport>,
 }
 
 impl Checked<'_> {
     /// Every limit that the pack is past.
     pub fn breaches(&self) -> Vec<Breach> {
+        let past = [self.sizes(), self.quality(), self.time(), self.changes()];
+        past.into_iter().flatten().collect()
+    }
+
+    fn breach(
+        &self,
+        budget: &'static str,
+        figure: Option<f64>,
+        limit: f64,
+        message: String,
+        remedy: String,
+    ) -> Breach {
+        Breach { asset: Some(self.name.to_owned()), budget, figure, limit: Some(limit), message, remedy }
+    }
+
+    /// What was not measured is past its limit: one that cannot fail is none.
+    fn unknown(&self, budget: &'static str, limit: Option<f64>, message: &str, remedy: &str) -> Breach {
+        let (message, remedy) = (message.to_owned(), remedy.to_owned());
+        Breach { asset: Some(self.name.to_owned()), budget, figure: None, limit, message, remedy }
+    }
+
+    fn sizes(&self) -> Vec<Breach> {
         let (budget, figures) = (self.budget, self.figures);
+        let over = |is: u64, limit: u64| format!("{} are over {}", bytes(is), bytes(limit));
         let mut out = Vec::new();
-        let mut past = |budget, figure, limit, message, remedy| {
-            let asset = Some(self.name.to_owned());
-            out.push(Breach { asset, budget, figure, limit, message, remedy });
-        };
         if let Some(limit) = budget.gpu_size.map(|size| size.0).filter(|limit| figures.gpu_bytes > *limit) {
-            let message = format!("{} are over {}", bytes(figures.gpu_bytes), bytes(limit));
-            let remedy = self.adaptive(&format!("size = {limit} would meet it"));
-            past("gpu_size", Some(figures.gpu_bytes as f64), limit as f64, message, remedy);
+            let message = over(figures.gpu_bytes, limit);
+            let is = Some(figures.gpu_bytes as f64);
+            out.push(self.breach("gpu_size", is, limit as f64, message, self.smaller(limit as f64)));
         }
         if let Some(limit) = budget.file_size.map(|size| size.0).filter(|limit| figures.file_bytes > *limit) {
-            let message = format!("{} are over {}", bytes(figures.file_bytes), bytes(limit));
-            let remedy = self.smaller_file(limit);
-            past("file_size", Some(figures.file_bytes as f64), limit as f64, message, remedy);
+            let message = over(figures.file_bytes, limit);
+            let is = Some(figures.file_bytes as f64);
+            out.push(self.breach("file_size", is, limit as f64, message, self.smaller_file(limit as f64)));
         }
         if let Some(limit) =
             budget.tree_share.map(|share| share.0).filter(|limit| figures.tree_share > *limit)
@@ -84,143 +103,185 @@ impl Checked<'_> {
                     "the tree is the volume's shape: a larger tree_share, or more texels to it by a finer psnr"
                 }
             };
-            past("tree_share", Some(figures.tree_share), limit, message, remedy.to_owned());
+            out.push(self.breach("tree_share", Some(figures.tree_share), limit, message, remedy.to_owned()));
         }
-        if let Some(limit) = budget.min_psnr {
-            let remedy = self.adaptive(&format!("psnr = {limit} would meet it"));
-            match (figures.compared, figures.psnr) {
-                (true, Some(psnr)) if psnr < limit => {
-                    past("min_psnr", Some(psnr), limit, format!("{psnr:.2} dB are under {limit} dB"), remedy);
-                }
-                (true, _) => {}
-                (false, _) => past("min_psnr", None, limit, NOT_COMPARED.to_owned(), COMPARE.to_owned()),
-            }
-        }
-        self.check_errors(&mut past);
-        if let Some(limit) = budget.max_flip {
-            match figures.flip {
-                Some(flip) if flip > limit => {
-                    let remedy = match figures.psnr {
-                        // FLIP falls more slowly than the error: to half for 6 to 9 dB.
-                        Some(psnr) => {
-                            let db = ((psnr + 30.0 * (flip / limit).log10()) * 2.0).ceil() / 2.0;
-                            self.adaptive(&format!("psnr = {db} should meet it"))
-                        }
-                        None => "nothing is more exact than this pack".to_owned(),
-                    };
-                    past("max_flip", Some(flip), limit, format!("{flip:.4} is over {limit}"), remedy);
-                }
-                Some(_) => {}
-                None => past(
-                    "max_flip",
-                    None,
-                    limit,
-                    "no pictures were compared".to_owned(),
-                    "build with --verify all".to_owned(),
-                ),
-            }
-        }
-        if let Some((limit, took)) =
-            budget.build_seconds.zip(figures.build_seconds).filter(|(l, took)| took > l)
-        {
-            let message = format!("{} are over {}", seconds(took), seconds(limit));
-            let remedy = if took - self.verify_seconds <= limit {
-                format!("--verify none would meet it: verification took {}", seconds(self.verify_seconds))
-            } else {
-                "a cache (no --no-cache) leaves only what changed; format = \"unorm8\" needs no search"
-                    .to_owned()
-            };
-            past("build_seconds", Some(took), limit, message, remedy);
-        }
-        self.check_baseline(&mut past);
         out
     }
 
-    /// What texels may take so that the file does not take more, by how well this pack's are packed.
-    fn smaller_file(&self, limit: u64) -> String {
-        let texels = self.pack.stored_texel_bytes();
-        let Some(left) = limit.checked_sub(self.figures.file_bytes - texels).filter(|left| *left > 0) else {
-            return "no size would meet it: the rest of the file is tree and tables".to_owned();
-        };
-        let of_texels = left as f64 / texels.max(1) as f64 * (1.0 - FILE_MARGIN);
-        let tree = self.figures.gpu_bytes as f64 * self.figures.tree_share;
-        let size = tree + (self.figures.gpu_bytes as f64 - tree) * of_texels;
-        self.adaptive(&format!("size = {size:.0} on the GPU should meet it"))
-    }
-
-    /// A promise for every voxel, in what each grid measures it in.
-    fn check_errors(&self, past: &mut impl FnMut(&'static str, Option<f64>, f64, String, String)) {
-        let Some(bound) = self.budget.max_error else { return };
-        let Some(found) = self.found else {
-            return past("max_error", None, 0.0, NOT_COMPARED.to_owned(), COMPARE.to_owned());
-        };
-        for (report, grid) in found.grids.iter().zip(&self.pack.grids) {
-            let voxel = grid.frames.first().map_or(1.0, |frame| voxel_size(&frame.record.transform));
-            let (error, limit) = (report.active.max_error, bound.absolute(report.peak, voxel));
-            if error > limit {
-                let message = format!("{error:.3e} of {} is over {limit:.3e} ({bound})", report.grid);
-                let remedy = self.adaptive(&format!("max_error = \"{bound}\" would meet it"));
-                past("max_error", Some(error), limit, message, remedy);
+    fn quality(&self) -> Vec<Breach> {
+        let (budget, figures) = (self.budget, self.figures);
+        let mut out = Vec::new();
+        if let Some(limit) = budget.min_psnr.filter(|_| !figures.exact) {
+            match figures.psnr {
+                Some(psnr) if psnr < limit => {
+                    let message = format!("{psnr:.2} dB are under {limit} dB");
+                    let remedy = self.adaptive(&format!("psnr = {limit}"), "would");
+                    out.push(self.breach("min_psnr", Some(psnr), limit, message, remedy));
+                }
+                Some(_) => {}
+                None if figures.compared => {
+                    out.push(self.unknown("min_psnr", Some(limit), NO_RANGE, USE_MAX_ERROR))
+                }
+                None => out.push(self.unknown("min_psnr", Some(limit), NOT_COMPARED, COMPARE)),
             }
         }
+        if let Some(bound) = budget.max_error {
+            match self.found {
+                Some(found) => out.extend(self.errors(found, bound)),
+                None => out.push(self.unknown("max_error", bound.fraction(), NOT_COMPARED, COMPARE)),
+            }
+        }
+        if let Some(limit) = budget.max_flip {
+            match figures.flip {
+                Some(flip) if flip > limit => {
+                    // FLIP falls more slowly than the error: to half for 6 to 9 dB.
+                    let finer = |psnr: f64| ((psnr + 30.0 * (flip / limit).log10()) * 2.0).ceil() / 2.0;
+                    let remedy = figures.psnr.map_or_else(
+                        || "format = \"f32\" is exact".to_owned(),
+                        |psnr| self.adaptive(&format!("psnr = {}", finer(psnr)), "should"),
+                    );
+                    out.push(self.breach(
+                        "max_flip",
+                        Some(flip),
+                        limit,
+                        format!("{flip:.4} is over {limit}"),
+                        remedy,
+                    ));
+                }
+                Some(_) => {}
+                None => out.push(self.unknown(
+                    "max_flip",
+                    Some(limit),
+                    "no pictures were compared",
+                    "build with --verify all",
+                )),
+            }
+        }
+        out
     }
 
-    fn check_baseline(&self, past: &mut impl FnMut(&'static str, Option<f64>, f64, String, String)) {
-        let Some(old) = self.baseline else { return };
+    /// The largest error of each grid, in what it measures it in.
+    fn errors(&self, found: &VerifyReport, bound: ErrorBound) -> Vec<Breach> {
+        let grids = found.grids.iter().zip(&self.pack.grids);
+        let past = grids.filter_map(|(report, grid)| {
+            let voxel = grid.frames.first().map_or(1.0, |frame| voxel_size(&frame.record.transform));
+            let (error, limit) = (report.active.max_error, bound.absolute(report.peak, voxel));
+            let message = format!("{error:.3e} of {} is over {limit:.3e} ({bound})", report.grid);
+            let remedy = self.adaptive(&format!("max_error = \"{bound}\""), "would");
+            (error > limit).then(|| self.breach("max_error", Some(error), limit, message, remedy))
+        });
+        past.collect()
+    }
+
+    fn time(&self) -> Vec<Breach> {
+        let Some((limit, build)) = self.budget.build_seconds.zip(self.build) else { return Vec::new() };
+        let (all, verify) = (build.seconds(None), build.seconds(Some("verify")));
+        if all <= limit {
+            return Vec::new();
+        }
+        let remedy = if all - verify <= limit {
+            format!("verification took {}: build with --verify structure", seconds(verify))
+        } else {
+            "a cache (no --no-cache) leaves only what changed; format = \"unorm8\" needs no search".to_owned()
+        };
+        let message = format!("{} are over {}", seconds(all), seconds(limit));
+        vec![self.breach("build_seconds", Some(all), limit, message, remedy)]
+    }
+
+    fn changes(&self) -> Vec<Breach> {
+        let Some(old) = self.baseline else { return Vec::new() };
         let change = self.figures.change_from(old);
+        let mut out = Vec::new();
         if let Some(limit) = self.budget.max_growth.map(|share| share.0) {
-            for (what, growth, old) in [
-                ("on the GPU", change.gpu_bytes, old.gpu_bytes),
-                ("of the file", change.file_bytes, old.file_bytes),
-            ] {
-                if growth > limit {
-                    let message = format!(
-                        "the bytes {what} grew by {:.1} % from {}, over {:.1} %",
-                        growth * 100.0,
-                        bytes(old),
-                        limit * 100.0
-                    );
-                    let size = self.figures.gpu_bytes as f64 / (1.0 + growth) * (1.0 + limit);
-                    let remedy = self.adaptive(&format!("size = {size:.0} should meet it"));
-                    past("max_growth", Some(growth), limit, message, remedy);
+            let grew = |what: &str, growth: f64, old: u64| {
+                let (growth, limit) = (growth * 100.0, limit * 100.0);
+                format!("the bytes {what} grew by {growth:.1} % from {}, over {limit:.1} %", bytes(old))
+            };
+            if change.gpu_bytes > limit {
+                let message = grew("on the GPU", change.gpu_bytes, old.gpu_bytes);
+                let remedy = self.smaller(old.gpu_bytes as f64 * (1.0 + limit));
+                out.push(self.breach("max_growth", Some(change.gpu_bytes), limit, message, remedy));
+            }
+            if change.file_bytes > limit {
+                let message = grew("of the file", change.file_bytes, old.file_bytes);
+                let remedy = self.smaller_file(old.file_bytes as f64 * (1.0 + limit));
+                out.push(self.breach("max_growth", Some(change.file_bytes), limit, message, remedy));
+            }
+        }
+        if let Some(limit) = self.budget.max_psnr_loss.filter(|_| !self.figures.exact) {
+            match (self.figures.psnr, old.psnr) {
+                (Some(new), Some(old)) if old - new > limit => {
+                    let message =
+                        format!("{new:.2} dB, the baseline is {old:.2} dB: more than {limit} dB are lost");
+                    // Rounded up, so that what is typed is enough.
+                    let asked = ((old - limit) * 100.0).ceil() / 100.0;
+                    let remedy = self.adaptive(&format!("psnr = {asked}"), "would");
+                    out.push(self.breach("max_psnr_loss", Some(old - new), limit, message, remedy));
+                }
+                (Some(_), Some(_)) => {}
+                (Some(new), None) if old.exact => {
+                    let message = format!("{new:.2} dB, the baseline is exact");
+                    out.push(self.breach(
+                        "max_psnr_loss",
+                        None,
+                        limit,
+                        message,
+                        "format = \"f32\" is exact".to_owned(),
+                    ));
+                }
+                _ => {
+                    let message = "the pack, or that of the baseline, was not measured";
+                    out.push(self.unknown("max_psnr_loss", Some(limit), message, COMPARE));
                 }
             }
         }
-        if let Some(limit) = self.budget.max_psnr_loss {
-            let was = old.psnr.map_or_else(|| "exact".to_owned(), |db| format!("{db:.2} dB"));
-            let is_lost = match (self.figures.psnr, old.psnr) {
-                (Some(new), Some(old)) => old - new > limit,
-                // What was exact and is not has lost more than any number.
-                (Some(_), None) => old.compared,
-                (None, _) => false,
-            };
-            if let Some(new) = self.figures.psnr.filter(|_| is_lost) {
-                let message = format!("{new:.2} dB, the baseline is {was}: more than {limit} dB are lost");
-                let remedy = match old.psnr {
-                    Some(old) => self.adaptive(&format!("psnr = {:.2} would meet it", old - limit)),
-                    None => "format = \"f32\" is exact".to_owned(),
-                };
-                past("max_psnr_loss", old.psnr.map(|old| old - new), limit, message, remedy);
-            }
-        }
+        out
     }
 
-    /// A setting of adaptive packs, said so that it can be used.
-    fn adaptive(&self, setting: &str) -> String {
+    /// What to ask for so that the pack takes at most `limit` bytes on a GPU.
+    fn smaller(&self, limit: f64) -> String {
+        let tree = self.figures.gpu_bytes as f64 * self.figures.tree_share;
+        if limit <= tree {
+            return format!("no size would meet it: tree and masks are {}", bytes(tree as u64));
+        }
+        self.adaptive(&format!("size = {limit:.0}"), "should")
+    }
+
+    /// The same for its file, by how well this pack's texels are packed.
+    fn smaller_file(&self, limit: f64) -> String {
+        let stored = self.pack.stored_texel_bytes() as f64;
+        let left = limit - (self.figures.file_bytes as f64 - stored);
+        if left <= 0.0 {
+            return "no size would meet it: the rest of the file is tree and tables".to_owned();
+        }
+        let tree = self.figures.gpu_bytes as f64 * self.figures.tree_share;
+        let texels = self.figures.gpu_bytes as f64 - tree;
+        self.smaller(tree + texels * left / stored.max(1.0) * (1.0 - FILE_MARGIN))
+    }
+
+    /// A setting of adaptive packs, and what it does not go with.
+    fn adaptive(&self, setting: &str, would: &str) -> String {
         let settings = &self.pack.provenance.settings;
-        let replaces = match (settings.format, settings.quality) {
-            (Format::Adaptive, Quality::Psnr(_)) if setting.starts_with("psnr") => "",
-            (Format::Adaptive, Quality::Size(_)) if setting.starts_with("size") => "",
-            (Format::Adaptive, Quality::MaxError(_)) if setting.starts_with("max_error") => "",
-            (Format::Adaptive, quality) => return format!("{setting}, in place of {}", key(quality)),
-            _ => "format = \"adaptive\" with ",
-        };
-        format!("{replaces}{setting}")
+        let asked = key(settings.quality);
+        let format = if settings.format == Format::Adaptive { "" } else { "format = \"adaptive\" with " };
+        let mut remedy = format!("{format}{setting} {would} meet it");
+        if settings.format == Format::Adaptive && !setting.starts_with(asked) {
+            remedy += &format!(", in place of {asked}");
+        }
+        if settings.clustering.is_some() {
+            remedy += ", without dedup";
+        }
+        if settings.min_frame_psnr.is_some() && !setting.starts_with("psnr") {
+            remedy += ", without min_frame_psnr";
+        }
+        remedy
     }
 }
 
 const NOT_COMPARED: &str = "the pack was not compared with its source";
 const COMPARE: &str = "build with --verify voxels";
+const NO_RANGE: &str = "all active values are one, so that there is no range to measure by";
+const USE_MAX_ERROR: &str = "limit max_error, in units";
 
 /// What a manifest calls it.
 fn key(quality: Quality) -> &'static str {
@@ -236,7 +297,7 @@ fn key(quality: Quality) -> &'static str {
 pub fn of_total(total: &Total, packs: &[(&str, &Figures)]) -> Vec<Breach> {
     let mut out = Vec::new();
     let mut past = |budget, figure: f64, limit: f64, message, remedy| {
-        out.push(Breach { asset: None, budget, figure: Some(figure), limit, message, remedy });
+        out.push(Breach { asset: None, budget, figure: Some(figure), limit: Some(limit), message, remedy });
     };
     let largest = |of: fn(&Figures) -> u64| {
         let largest = packs.iter().map(|(name, figures)| (of(figures), name)).max();

@@ -21,6 +21,7 @@ pub(super) fn costs(pack: &Pack, found: Option<&VerifyReport>) -> Vec<FrameCost>
                     shown.insert((record.codec, record.slot));
                 }
             });
+            let found = found.and_then(|found| found.frames.get(out.len()));
             let size = |slots: &mut dyn Iterator<Item = &(Codec, u32)>| {
                 slots.map(|(codec, _)| codec.layout().brick_bytes() as u64).sum()
             };
@@ -29,7 +30,8 @@ pub(super) fn costs(pack: &Pack, found: Option<&VerifyReport>) -> Vec<FrameCost>
                 frame: frame.record.number,
                 texel_bytes: size(&mut shown.iter()),
                 new_texel_bytes: size(&mut shown.difference(&seen)),
-                psnr: found.and_then(|found| found.frames.get(out.len())).and_then(|frame| frame.active.psnr),
+                psnr: found.and_then(|frame| frame.active.psnr),
+                exact: found.is_some_and(|frame| frame.active.max_error == 0.0),
             });
             seen.extend(shown);
         }

@@ -1,5 +1,7 @@
 //! Pictures of a pack, as PNG. Traced on the CPU, so that they are the same everywhere.
 
+use std::path::PathBuf;
+
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -69,23 +71,26 @@ impl Png {
     }
 }
 
-/// Draws a pack, or takes its pictures from the cache. `digest` is BLAKE3 of its file.
+/// Draws a pack, or takes its pictures from the cache. `digest` is BLAKE3 of its file. Among `files` are its sources, if
+/// there are any: they are looked for where there is something to draw.
 ///
 /// # Errors
 /// When a source or a chunk of the pack cannot be read.
 pub fn gallery(
     pack: &Pack,
     digest: &[u8; 32],
-    sources: Option<&Sources>,
+    files: Option<&[PathBuf]>,
     found: Option<&VerifyReport>,
     cache: Option<&Cache>,
 ) -> Result<Gallery> {
     let worst = found.and_then(|found| found.worst_frame.as_ref());
     let worst = worst.map(|worst| (worst.grid.as_str(), worst.frame));
-    let key = Key::new(&STAGE, &(digest, sources.is_some(), worst));
+    let key = Key::new(&STAGE, &(digest, files.is_some(), worst));
     if let Some(known) = cache.and_then(|cache| cache.get(&key)) {
         return Ok(known);
     }
+    let sources = files.map(|files| Sources::find(pack, files)).transpose()?;
+    let sources = sources.as_ref();
     let mut places = Vec::new();
     for (g, grid) in pack.grids.iter().enumerate() {
         let is_worst = |f: usize| worst == Some((grid.name.as_str(), grid.frames[f].record.number));
@@ -139,6 +144,9 @@ fn strip(pack: &Pack, g: usize) -> Result<Option<Strip>> {
     // One camera for all: around everything that any of them has.
     let mut bounds = CoordBox::EMPTY;
     frames.iter().for_each(|&f| bounds.union(pack.frame_tree(g, f).bounds()));
+    if bounds.is_empty() {
+        return Ok(None);
+    }
     let mode = Mode::of_grid(grid);
     let draw = |&f: &usize| -> Result<Vec<u8>> {
         crate::interrupt::check()?;

@@ -1,7 +1,5 @@
 //! A report as one page that needs nothing beside it.
 
-use std::collections::BTreeMap;
-
 use askama::Template;
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
@@ -11,7 +9,7 @@ use super::chart::{ChartError, Line, frames_svg, histogram_svg};
 use super::gallery::{Gallery, Png};
 use super::markdown::arrow;
 use super::model::{AssetReport, Figures, PackReport, Report};
-use crate::units::{bytes, count, psnr, seconds};
+use crate::units::{bytes, count, seconds};
 
 /// Why a page could not be made.
 #[derive(Debug, thiserror::Error)]
@@ -43,6 +41,8 @@ struct Fact {
     path: String,
     value: String,
     text: String,
+    /// What tables are sorted by; none goes last.
+    sort: Option<f64>,
     /// Against the baseline, and whether that is for the better.
     change: Option<(String, bool)>,
 }
@@ -99,14 +99,14 @@ struct Offer<'a> {
     facts: [Fact; 4],
 }
 
-/// The report as HTML, with a gallery for each asset that has one, by its name.
+/// The report as HTML, with the gallery of each asset that has one, in the same order.
 ///
 /// # Errors
 /// When a chart or the template fails.
-pub fn html(report: &Report, galleries: &BTreeMap<String, Gallery>) -> Result<String, PageError> {
+pub fn html(report: &Report, galleries: &[Option<Gallery>]) -> Result<String, PageError> {
     let assets = report.assets.iter().enumerate();
     let assets: Vec<Asset> = assets
-        .map(|(i, asset)| view(report, i, asset, galleries.get(&asset.name)))
+        .map(|(i, asset)| view(report, i, asset, galleries.get(i).and_then(Option::as_ref)))
         .collect::<Result<_, _>>()?;
     let total = |label, key: &str, value: u64, budget: Option<u64>| {
         let of = budget.map(|budget| format!(" of {}", bytes(budget))).unwrap_or_default();
@@ -155,7 +155,10 @@ fn verdict(report: &Report) -> String {
 }
 
 fn fact(label: &'static str, path: String, value: impl ToString, text: String) -> Fact {
-    Fact { label, path, value: value.to_string(), text, change: None }
+    let value = value.to_string();
+    // What is exact is better than any number.
+    let sort = value.parse().ok().or((text == "exact").then_some(f64::INFINITY));
+    Fact { label, path, value, text, sort, change: None }
 }
 
 fn optional(value: Option<f64>) -> String {
@@ -201,7 +204,6 @@ fn details<'a>(
     };
     let frame = |(i, frame): (usize, &super::model::FrameCost)| {
         let path = |key: &str| format!("{path}/frames/{i}/{key}");
-        let compared = pack.figures.compared;
         [
             fact("frame", path("frame"), frame.frame, frame.frame.to_string()),
             fact("texels", path("texel_bytes"), frame.texel_bytes, bytes(frame.texel_bytes)),
@@ -210,7 +212,7 @@ fn details<'a>(
                 "PSNR",
                 path("psnr"),
                 optional(frame.psnr),
-                if compared { psnr(frame.psnr) } else { "–".to_owned() },
+                if frame.exact { "exact".to_owned() } else { pack.figures.decibels(frame.psnr) },
             ),
         ]
     };
@@ -237,17 +239,16 @@ fn details<'a>(
 fn facts(path: &str, pack: &PackReport) -> Vec<Fact> {
     let figures = &pack.figures;
     let path = |key: &str| format!("{path}/figures/{key}");
-    let decibels = |db: Option<f64>| if figures.compared { psnr(db) } else { "not compared".to_owned() };
     let or_none = |value: Option<String>| value.unwrap_or_else(|| "not compared".to_owned());
     let mut facts = vec![
         fact("On the GPU", path("gpu_bytes"), figures.gpu_bytes, bytes(figures.gpu_bytes)),
         fact("File", path("file_bytes"), figures.file_bytes, bytes(figures.file_bytes)),
-        fact("PSNR", path("psnr"), optional(figures.psnr), decibels(figures.psnr)),
+        fact("PSNR", path("psnr"), optional(figures.psnr), figures.decibels(figures.psnr)),
         fact(
             "Worst frame",
             path("worst_frame_psnr"),
             optional(figures.worst_frame_psnr),
-            decibels(figures.worst_frame_psnr),
+            figures.decibels(figures.worst_frame_psnr),
         ),
         fact(
             "Largest error, of the range",
@@ -275,7 +276,8 @@ fn facts(path: &str, pack: &PackReport) -> Vec<Fact> {
         let gain = |db: Option<f64>| db.map(|db| (arrow(db, "dB", 2), db >= 0.0));
         facts[0].change = growth(change.gpu_bytes);
         facts[1].change = growth(change.file_bytes);
-        facts[2].change = gain(change.psnr);
+        let lost = change.lost_exactness.then(|| ("no longer exact".to_owned(), false));
+        facts[2].change = gain(change.psnr).or(lost);
         facts[3].change = gain(change.worst_frame_psnr);
     }
     facts
@@ -349,18 +351,24 @@ fn player(strip: &super::Strip) -> Player {
 fn offer((i, asset): (usize, &AssetReport)) -> Option<Offer<'_>> {
     let pack = asset.pack.as_ref()?;
     let (cheaper, figures): (_, &Figures) = (pack.cheaper.as_ref()?, &pack.figures);
-    let path = |key: &str| format!("/assets/{i}/pack/cheaper/{key}");
-    let saved = figures.gpu_bytes.saturating_sub(cheaper.gpu_bytes);
+    let path = |key: &str| format!("/assets/{i}/pack/cheaper/figures/{key}");
+    let offered = &cheaper.figures;
+    let saved = figures.gpu_bytes.saturating_sub(offered.gpu_bytes);
     Some(Offer {
         name: &asset.name,
         id: id(i),
         setting: &cheaper.setting,
         saved,
         facts: [
-            fact("GPU", path("gpu_bytes"), cheaper.gpu_bytes, bytes(cheaper.gpu_bytes)),
+            fact("GPU", path("gpu_bytes"), offered.gpu_bytes, bytes(offered.gpu_bytes)),
             fact("saves", String::new(), saved, bytes(saved)),
-            fact("PSNR", path("psnr"), optional(cheaper.psnr), psnr(cheaper.psnr)),
-            fact("largest error", path("max_error"), cheaper.max_error, percent(cheaper.max_error)),
+            fact("PSNR", path("psnr"), optional(offered.psnr), offered.decibels(offered.psnr)),
+            fact(
+                "largest error",
+                path("max_error"),
+                optional(offered.max_error),
+                offered.max_error.map_or_else(String::new, percent),
+            ),
         ],
     })
 }

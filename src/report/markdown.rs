@@ -2,22 +2,23 @@
 
 use askama::Template;
 
-use super::model::{AssetReport, PackReport, Report};
-use crate::units::{bytes, psnr};
+use super::model::{PackReport, Report};
+use crate::units::bytes;
 
 #[derive(Template)]
 #[template(path = "report.md", config = "src/report/templates/askama.toml", escape = "none")]
 struct Page<'a> {
     report: &'a Report,
-    rows: Vec<Row<'a>>,
+    rows: Vec<Row>,
+    breaches: Vec<String>,
     /// Bytes on the GPU and of the files, and what they may be.
     total: [String; 2],
 }
 
-struct Row<'a> {
+struct Row {
     name: String,
-    asset: &'a AssetReport,
-    is_over: bool,
+    error: Option<String>,
+    is_bad: bool,
     cells: Option<[String; 8]>,
 }
 
@@ -28,8 +29,9 @@ struct Row<'a> {
 pub fn markdown(report: &Report) -> Result<String, askama::Error> {
     let rows = report.assets.iter().map(|asset| Row {
         name: escape(&asset.name),
-        asset,
-        is_over: report.breaches.iter().any(|breach| breach.asset.as_ref() == Some(&asset.name)),
+        error: asset.error.as_deref().map(escape),
+        is_bad: asset.error.is_some()
+            || report.breaches.iter().any(|breach| breach.asset.as_ref() == Some(&asset.name)),
         cells: asset.pack.as_ref().map(cells),
     });
     let sum = |sum, budget: Option<u64>| match budget {
@@ -37,26 +39,28 @@ pub fn markdown(report: &Report) -> Result<String, askama::Error> {
         None => bytes(sum),
     };
     let sums = &report.total;
+    let breaches = report.breaches.iter().map(|breach| escape(&breach.to_string())).collect();
     let total = [sum(sums.gpu_bytes, sums.gpu_budget), sum(sums.file_bytes, sums.file_budget)];
-    Page { report, rows: rows.collect(), total }.render()
+    Page { report, rows: rows.collect(), breaches, total }.render()
 }
 
 fn cells(pack: &PackReport) -> [String; 8] {
     let figures = &pack.figures;
-    let decibels = |db: Option<f64>| if figures.compared { psnr(db) } else { "not compared".to_owned() };
     let percent = |part: Option<f64>| part.map_or_else(|| "-".to_owned(), |p| format!("{:.2} %", p * 100.0));
     [
         bytes(figures.gpu_bytes),
         bytes(figures.file_bytes),
         format!("{:.2}", figures.bits_per_voxel),
-        decibels(figures.psnr),
-        decibels(figures.worst_frame_psnr),
+        figures.decibels(figures.psnr),
+        figures.decibels(figures.worst_frame_psnr),
         percent(figures.max_error),
         figures.flip.map_or_else(|| "-".to_owned(), |flip| format!("{flip:.4}")),
         pack.change.as_ref().map_or_else(
             || "-".to_owned(),
             |change| {
-                let db = change.psnr.map(|db| format!(", {}", arrow(db, "dB", 2))).unwrap_or_default();
+                let db = change.psnr.map(|db| format!(", {}", arrow(db, "dB", 2)));
+                let exact = change.lost_exactness.then(|| ", no longer exact".to_owned());
+                let db = db.or(exact).unwrap_or_default();
                 format!("GPU {}{db}", arrow(change.gpu_bytes * 100.0, "%", 1))
             },
         ),
@@ -72,15 +76,18 @@ pub(super) fn arrow(change: f64, unit: &str, digits: usize) -> String {
     format!("{} {rounded} {unit}", if change > 0.0 { "↑" } else { "↓" })
 }
 
-/// A name, so that it cannot break the table.
+/// Text, so that it cannot break the table, hide what follows or call anyone.
 fn escape(text: &str) -> String {
-    let special = |c: char| "\\|`*_<>[]".contains(c);
     let mut out = String::new();
     for c in text.chars().map(|c| if c.is_control() { ' ' } else { c }) {
-        if special(c) {
-            out.push('\\');
+        match c {
+            '&' => out.push_str("&amp;"),
+            '<' => out.push_str("&lt;"),
+            // A name after a space of no width is nobody's.
+            '@' => out.push_str("@\u{200b}"),
+            '\\' | '|' | '`' | '*' | '_' | '>' | '[' | ']' | '~' | '#' => out.extend(['\\', c]),
+            c => out.push(c),
         }
-        out.push(c);
     }
     out
 }

@@ -62,12 +62,8 @@ impl Reported<'_> {
     pub fn report(self) -> (PackReport, Vec<Breach>) {
         let pack = self.pack;
         let summary = PackSummary::new(pack);
-        let seconds = self.build.as_ref().map(|build| build.stages.iter().map(|stage| stage.seconds).sum());
-        let figures = Figures::new(&summary, pack, self.found.as_ref(), seconds);
+        let figures = Figures::new(pack, &summary, self.found.as_ref(), self.build.as_ref());
         let baseline = self.baseline.and_then(|baseline| baseline.figures(self.name));
-        let of_verify = |build: &BuildReport| {
-            build.stages.iter().filter(|stage| stage.stage == "verify").map(|stage| stage.seconds).sum()
-        };
         let breaches = budget::Checked {
             name: self.name,
             budget: self.budget,
@@ -75,7 +71,7 @@ impl Reported<'_> {
             baseline,
             pack,
             found: self.found.as_ref(),
-            verify_seconds: self.build.as_ref().map_or(0.0, of_verify),
+            build: self.build.as_ref(),
         }
         .breaches();
         let mut settings = serde_json::to_value(&pack.provenance.settings).unwrap_or_default();

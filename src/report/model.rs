@@ -108,7 +108,10 @@ pub struct Figures {
     pub compared: bool,
     /// Whether nothing is wrong with what was compared.
     pub ok: bool,
-    /// The PSNR of the worst grid over active leaf voxels, in dB; null where it is exact, or was not compared.
+    /// Whether voxels were compared, and no active leaf voxel has an error.
+    pub exact: bool,
+    /// The PSNR of the worst grid over active leaf voxels, in dB; null where it is exact, was not compared, or has no
+    /// range of values to measure by.
     pub psnr: Option<f64>,
     /// The worst frame's; null likewise.
     pub worst_frame_psnr: Option<f64>,
@@ -131,6 +134,8 @@ pub struct Change {
     pub psnr: Option<f64>,
     /// Of `worst_frame_psnr`, likewise.
     pub worst_frame_psnr: Option<f64>,
+    /// Whether it was exact and is not.
+    pub lost_exactness: bool,
 }
 
 /// What one frame of one grid costs.
@@ -144,8 +149,10 @@ pub struct FrameCost {
     pub texel_bytes: u64,
     /// Those that no frame before it shows.
     pub new_texel_bytes: u64,
-    /// Its PSNR over active leaf voxels, in dB; null where it is exact, or was not compared.
+    /// Its PSNR over active leaf voxels, in dB; null as that of the pack.
     pub psnr: Option<f64>,
+    /// Whether voxels were compared, and no active leaf voxel has an error.
+    pub exact: bool,
 }
 
 /// How a pack came to be in this run.
@@ -189,14 +196,8 @@ pub struct StageSeconds {
 pub struct Cheaper {
     /// The setting, as a manifest has it.
     pub setting: String,
-    /// Bytes on a GPU.
-    pub gpu_bytes: u64,
-    /// Bytes of the file.
-    pub file_bytes: u64,
-    /// The PSNR of the worst grid over active leaf voxels, in dB; null where it is exact.
-    pub psnr: Option<f64>,
-    /// The largest error of an active leaf voxel, as a part of its grid's range.
-    pub max_error: f64,
+    /// What it gives.
+    pub figures: Figures,
 }
 
 /// How to make a pack again.
@@ -233,6 +234,14 @@ impl From<&Source> for SourceFile {
     }
 }
 
+impl BuildReport {
+    /// Seconds of a stage, or of all.
+    pub fn seconds(&self, stage: Option<&str>) -> f64 {
+        let of = self.stages.iter().filter(|each| stage.is_none_or(|stage| stage == each.stage));
+        of.map(|stage| stage.seconds).sum()
+    }
+}
+
 impl Total {
     /// Adds packs up.
     pub fn new(packs: &[(&str, &Figures)], budget: &Budget) -> Self {
@@ -250,17 +259,28 @@ impl Total {
 }
 
 impl Figures {
+    /// A PSNR of this pack, for people.
+    pub fn decibels(&self, psnr: Option<f64>) -> String {
+        match psnr {
+            Some(_) => crate::units::psnr(psnr),
+            None if self.exact => "exact".to_owned(),
+            None if self.compared => "no range".to_owned(),
+            None => "not compared".to_owned(),
+        }
+    }
+
     /// Sums up a pack and what was found of it.
     pub fn new(
-        summary: &PackSummary,
         pack: &Pack,
+        summary: &PackSummary,
         found: Option<&VerifyReport>,
-        seconds: Option<f64>,
+        build: Option<&BuildReport>,
     ) -> Self {
         let tree = summary.tree_bytes + summary.mask_bytes;
         let of_range = |max: f64, peak: f64| if peak > 0.0 { max / peak } else { max };
         let largest = |all: &mut dyn Iterator<Item = f64>| all.fold(0.0, f64::max);
-        let pictures = found.and_then(|found| found.pictures.as_ref()).filter(|p| !p.pictures.is_empty());
+        // Where the ring found nothing to draw, nothing differs.
+        let pictures = found.and_then(|found| found.pictures.as_ref());
         Self {
             gpu_bytes: summary.gpu_bytes,
             file_bytes: summary.file_bytes,
@@ -273,12 +293,13 @@ impl Figures {
             bits_per_voxel: summary.bits_per_voxel,
             compared: found.is_some(),
             ok: found.is_none_or(|found| found.ok),
+            exact: found.is_some_and(|found| found.grids.iter().all(|grid| grid.active.max_error == 0.0)),
             psnr: found.and_then(|found| found.active.psnr),
             worst_frame_psnr: found.and_then(|found| found.worst_frame.as_ref()).map(|worst| worst.psnr),
             max_error: found
                 .map(|found| largest(&mut found.grids.iter().map(|g| of_range(g.active.max_error, g.peak)))),
             flip: pictures.map(|p| largest(&mut p.pictures.iter().map(|p| p.source.flip))),
-            build_seconds: seconds,
+            build_seconds: build.map(|build| build.seconds(None)),
         }
     }
 
@@ -291,6 +312,7 @@ impl Figures {
             file_bytes: growth(self.file_bytes, old.file_bytes),
             psnr: difference(self.psnr, old.psnr),
             worst_frame_psnr: difference(self.worst_frame_psnr, old.worst_frame_psnr),
+            lost_exactness: old.exact && self.compared && !self.exact,
         }
     }
 }

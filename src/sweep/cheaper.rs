@@ -1,6 +1,7 @@
 //! The nearest cheaper setting of a pack, built and compared.
 
 use crate::error::{Error, Result};
+use crate::pack::Pack;
 use crate::pipeline::{Job, Progress, VerifyLevel, build};
 use crate::report::model::{Cheaper, Figures};
 use crate::settings::{Format, Quality, Settings};
@@ -18,6 +19,7 @@ const FINEST_DB: f64 = 60.0;
 /// # Errors
 /// As [`build`].
 pub fn cheaper(job: &Job, figures: &Figures, progress: &mut dyn Progress) -> Result<Option<Cheaper>> {
+    let most = figures.gpu_bytes;
     let Some((setting, settings)) = next(&job.settings, figures) else { return Ok(None) };
     let folder = tempfile::tempdir().map_err(Error::io(std::env::temp_dir()))?;
     let mut job = job.clone();
@@ -26,19 +28,10 @@ pub fn cheaper(job: &Job, figures: &Figures, progress: &mut dyn Progress) -> Res
     job.verify = VerifyLevel::Voxels;
     job.pictures.images = None;
     let outcome = build(&job, progress)?;
-    let found = outcome.verification.expect("voxels were asked for");
-    let of_range = |grid: &crate::verify::GridReport| {
-        if grid.peak > 0.0 { grid.active.max_error / grid.peak } else { grid.active.max_error }
-    };
+    let pack = Pack::open(&job.output).map_err(Error::pack(&job.output))?;
+    let figures = Figures::new(&pack, &outcome.summary, outcome.verification.as_ref(), None);
     // One that fails verification is no offer.
-    let is_offer = found.ok && outcome.summary.gpu_bytes < figures.gpu_bytes;
-    Ok(is_offer.then(|| Cheaper {
-        setting,
-        gpu_bytes: outcome.summary.gpu_bytes,
-        file_bytes: outcome.summary.file_bytes,
-        psnr: found.active.psnr,
-        max_error: found.grids.iter().map(of_range).fold(0.0, f64::max),
-    }))
+    Ok((figures.ok && figures.gpu_bytes < most).then_some(Cheaper { setting, figures }))
 }
 
 /// The next setting down, as a manifest has it.
@@ -61,15 +54,10 @@ fn next(settings: &Settings, figures: &Figures) -> Option<(String, Settings)> {
         _ => psnr(figures.psnr.map_or(FINEST_DB, |db| db.min(FINEST_DB).floor()))?,
     };
     let format = if settings.format == Format::Adaptive { "" } else { "format = \"adaptive\", " };
-    let floor = settings.min_frame_psnr.filter(|floor| !matches!(quality, Quality::Psnr(db) if *floor > db));
-    let settings = Settings {
-        format: Format::Adaptive,
-        quality,
-        min_frame_psnr: floor,
-        clustering: None,
-        ..settings.clone()
-    };
-    Some((format!("{format}{text}"), settings))
+    // A floor for frames stays: what is below it is not what was asked for.
+    let dedup = if settings.clustering.is_some() { ", no dedup" } else { "" };
+    let settings = Settings { format: Format::Adaptive, quality, clustering: None, ..settings.clone() };
+    Some((format!("{format}{text}{dedup}"), settings))
 }
 
 fn psnr(db: f64) -> Option<(String, Quality)> {

@@ -43,7 +43,7 @@ fn assert_given_up(remote: &Remote, server: &Server, reason: &str) {
     }
     assert_eq!(get_many(remote, Map::Actions, &keys(0..50), 1000), vec![None; 50]);
     remote.put(Map::Actions, key(1000), vec![1]);
-    let lines = remote.finish(CEILING, |_| {});
+    let lines = remote.finish(CEILING, |_| true);
     assert_eq!(server.requests(), asked, "the server was asked after it was given up");
     assert_eq!(lines.len(), 2, "{lines:?}");
     let given_up = "the remote cache s3://bucket/some/prefix was given up after 3 failures in a row: ";
@@ -64,7 +64,7 @@ fn what_was_put_is_found_and_nothing_else() {
     // Misses are no failures, however many.
     assert_eq!(get_many(&remote, Map::Blobs, &keys(1..20), 1000), vec![None; 19]);
     assert_eq!(get(&remote, Map::Blobs, key(0)), Some(b"entry 0".to_vec()));
-    assert_eq!(remote.finish(CEILING, |_| {}), Vec::<String>::new());
+    assert_eq!(remote.finish(CEILING, |_| true), Vec::<String>::new());
 
     let hex = format!("00000000{}", "a5".repeat(28));
     let place: PathBuf = ["bucket/some/prefix/blobs", &hex[..2], &hex[2..]].iter().collect();
@@ -76,7 +76,7 @@ fn a_bucket_without_a_prefix_works_too() {
     let server = Server::start();
     let remote = server.remote_at("s3://bucket", Policy::ReadWrite);
     remote.put(Map::Actions, key(7), vec![7]);
-    assert_eq!(remote.finish(CEILING, |_| {}), Vec::<String>::new());
+    assert_eq!(remote.finish(CEILING, |_| true), Vec::<String>::new());
     assert_eq!(get(&remote, Map::Actions, key(7)), Some(vec![7]));
     assert!(server.folder().join("bucket/actions/07").is_dir());
 }
@@ -103,7 +103,7 @@ fn an_object_longer_than_the_limit_is_a_miss_and_is_not_read() {
     // The buffers of a loopback connection hold a few MiB of what nobody reads.
     assert!(server.sent() < length as u64 / 2);
     assert_eq!(get(&remote, Map::Blobs, key(0)).map(|bytes| bytes.len()), Some(length));
-    assert_eq!(remote.finish(CEILING, |_| {}), Vec::<String>::new());
+    assert_eq!(remote.finish(CEILING, |_| true), Vec::<String>::new());
 }
 
 #[test]
@@ -120,7 +120,7 @@ fn blobs_are_written_once_and_actions_each_time() {
     let remote = server.remote(Policy::ReadWrite);
     remote.distrust(key(0));
     remote.put(Map::Blobs, key(0), vec![1; 10]);
-    assert_eq!(remote.finish(CEILING, |_| {}), Vec::<String>::new());
+    assert_eq!(remote.finish(CEILING, |_| true), Vec::<String>::new());
     assert_eq!(server.writes(), 4);
     let remote = server.filled(Map::Blobs, &[(key(0), vec![3; 11])]);
     assert_eq!((server.writes(), get(&remote, Map::Blobs, key(0))), (5, Some(vec![3; 11])));
@@ -146,7 +146,7 @@ fn racing_writers_leave_whole_objects() {
         }
     });
     for remote in &remotes {
-        assert_eq!(remote.finish(CEILING, |_| {}), Vec::<String>::new());
+        assert_eq!(remote.finish(CEILING, |_| true), Vec::<String>::new());
     }
     for bytes in get_many(&remotes[0], Map::Actions, &keys(0..20), u64::MAX) {
         let bytes = bytes.unwrap();
@@ -164,7 +164,7 @@ fn two_errors_are_retried() {
     assert_eq!(server.requests(), asked + 3);
     server.set(broken(2));
     remote.put(Map::Actions, key(1), vec![1]);
-    assert_eq!(remote.finish(CEILING, |_| {}), Vec::<String>::new());
+    assert_eq!(remote.finish(CEILING, |_| true), Vec::<String>::new());
     assert_eq!(get(&remote, Map::Actions, key(1)), Some(vec![1]));
 }
 
@@ -175,7 +175,7 @@ fn an_answer_that_breaks_off_is_resumed() {
     let remote = server.filled(Map::Blobs, &[(key(0), bytes.clone())]);
     server.set(Fault::Cut(1));
     assert!(get(&remote, Map::Blobs, key(0)) == Some(bytes));
-    assert_eq!(remote.finish(CEILING, |_| {}), Vec::<String>::new());
+    assert_eq!(remote.finish(CEILING, |_| true), Vec::<String>::new());
 }
 
 #[test]
@@ -188,7 +188,7 @@ fn failures_apart_are_told_but_give_nothing_up() {
         assert_eq!(get(&remote, Map::Actions, key(0)), None);
         assert_eq!(get(&remote, Map::Actions, key(0)), Some(b"entry 0".to_vec()));
     }
-    let lines = remote.finish(CEILING, |_| {});
+    let lines = remote.finish(CEILING, |_| true);
     assert_eq!(lines.len(), 1, "{lines:?}");
     let start = "4 requests to the remote cache s3://bucket/some/prefix failed, the last one: ";
     assert!(lines[0].starts_with(start), "{lines:?}");
@@ -285,7 +285,7 @@ fn a_server_killed_between_writes_is_told() {
         remote.put(Map::Blobs, key, bytes);
     }
     let start = Instant::now();
-    let lines = remote.finish(CEILING, |_| {});
+    let lines = remote.finish(CEILING, |_| true);
     assert!(start.elapsed() < CEILING);
     assert_eq!(lines.len(), 2, "{lines:?}");
     assert!(lines[0].contains("given up"), "{lines:?}");
@@ -300,7 +300,7 @@ fn what_is_only_read_is_never_written() {
     let remote = server.remote(Policy::Read);
     remote.put(Map::Actions, key(1), vec![1]);
     remote.put(Map::Blobs, key(1), vec![1]);
-    assert_eq!(remote.finish(CEILING, |_| {}), Vec::<String>::new());
+    assert_eq!(remote.finish(CEILING, |_| true), Vec::<String>::new());
     assert_eq!(server.requests(), asked);
     assert_eq!(get(&remote, Map::Actions, key(0)), Some(b"entry 0".to_vec()));
 }
@@ -314,12 +314,12 @@ fn what_does_not_fit_the_queue_is_dropped_and_told() {
         remote.put(Map::Actions, key(number), vec![0; 1 << 20]);
     }
     server.set(Fault::Nothing);
-    let lines = remote.finish(CEILING, |_| {});
+    let lines = remote.finish(CEILING, |_| true);
     assert_eq!(lines, ["6 entries were not uploaded to the remote cache s3://bucket/some/prefix"]);
     assert_eq!(server.writes(), 64);
     // There is room again, even for an entry that is longer than the queue.
     remote.put(Map::Blobs, key(0), vec![0; 65 << 20]);
-    assert_eq!(remote.finish(CEILING, |_| {}), lines);
+    assert_eq!(remote.finish(CEILING, |_| true), lines);
     assert_eq!(server.writes(), 65);
 }
 
@@ -332,7 +332,7 @@ fn the_end_waits_no_longer_than_it_may() {
         remote.put(Map::Blobs, key, bytes);
     }
     let start = Instant::now();
-    let lines = remote.finish(Duration::from_millis(50), |_| {});
+    let lines = remote.finish(Duration::from_millis(50), |_| true);
     assert_eq!(lines, ["30 entries were not uploaded to the remote cache s3://bucket/some/prefix"]);
     drop(remote);
     // Less than the patience for one answer: nothing in flight was waited for.
@@ -346,13 +346,13 @@ fn credentials_that_may_only_read_stop_the_writes_alone() {
     server.set(Fault::ReadOnly);
     let writes = server.writes();
     entries(1..10).into_iter().for_each(|(key, bytes)| remote.put(Map::Blobs, key, bytes));
-    let lines = remote.finish(CEILING, |_| {});
+    let lines = remote.finish(CEILING, |_| true);
     assert!(lines.len() == 1 && lines[0].contains("may not be written"), "{lines:?}");
     assert!(lines[0].ends_with("403 Forbidden AccessDenied"), "{lines:?}");
     assert!(server.writes() > writes);
     let writes = server.writes();
     remote.put(Map::Actions, key(1), vec![1]);
-    assert_eq!(remote.finish(CEILING, |_| {}), Vec::<String>::new());
+    assert_eq!(remote.finish(CEILING, |_| true), Vec::<String>::new());
     assert_eq!(server.writes(), writes);
     assert_eq!(get(&remote, Map::Actions, key(0)), Some(b"entry 0".to_vec()));
 }

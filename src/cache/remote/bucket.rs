@@ -225,9 +225,9 @@ impl Remote {
         lines
     }
 
-    /// Waits for the queued writes, but not longer than `at_most`, and tells now and then how many are left. Gives what
-    /// went wrong since the last time, one line each.
-    pub fn finish(&self, at_most: Duration, mut left: impl FnMut(u64)) -> Vec<String> {
+    /// Waits for the queued writes, but not longer than `at_most`: tells now and then how many are left, and goes on
+    /// while the answer is true. Gives what went wrong since the last time, one line each.
+    pub fn finish(&self, at_most: Duration, mut left: impl FnMut(u64) -> bool) -> Vec<String> {
         let shared = &*self.shared;
         self.handle.block_on(async {
             let end = Instant::now() + at_most;
@@ -236,10 +236,9 @@ impl Remote {
             tokio::pin!(empty);
             while Instant::now() < end {
                 let step = end.min(Instant::now() + STEP);
-                if timeout_at(step, &mut empty).await.is_ok() {
+                if timeout_at(step, &mut empty).await.is_ok() || !left(self.unsent()) {
                     break;
                 }
-                left(self.unsent());
             }
         });
         let mut lines = self.warnings();
@@ -304,6 +303,10 @@ impl Shared {
             match timeout_at(deadline, chunks.next()).await.map_err(silence)? {
                 None => return Ok(Some(bytes)),
                 Some(chunk) => bytes.extend_from_slice(&chunk.map_err(told)?),
+            }
+            // Whatever the server said of its length.
+            if bytes.len() as u64 > limit {
+                return Ok(None);
             }
         }
     }

@@ -37,7 +37,7 @@ impl Remote {
         match *self {}
     }
 
-    pub fn finish(&self, _: Duration, _: impl FnMut(u64)) -> Vec<String> {
+    pub fn finish(&self, _: Duration, _: impl FnMut(u64) -> bool) -> Vec<String> {
         match *self {}
     }
 }
