@@ -38,8 +38,7 @@ pub(super) fn read(
     let mut grids: Vec<GridInput> = Vec::new();
     for grid in &selection.grids {
         let fetch = cache.is_some().then(|| fetch(sequence, grid, settings));
-        let tree = SequenceTree::new(fetch).map_err(scratch)?;
-        grids.push(grid_input(sequence, grid, tree, settings));
+        grids.push(grid_input(sequence, grid, SequenceTree::new(fetch), settings));
     }
     for window in sequence.frames.chunks(rayon::current_num_threads()) {
         crate::interrupt::check()?;
@@ -60,6 +59,7 @@ pub(super) fn read(
             progress.advance(1);
         }
     }
+    grids.iter_mut().for_each(|grid| grid.tree.seal());
     Ok(grids)
 }
 

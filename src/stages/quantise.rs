@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use super::allocate::{Allocation, Coding};
 use super::dedup::SequenceTree;
-use super::encodings::{KeptCodec, Kind};
+use super::encodings::{KeptCodec, Kind, Tried};
 use super::relayout::{self, PlannedAtlas, Texture, TextureOf};
 use crate::codec::{Codec, OutOfRange, Texels, decode, encode};
 use crate::volume::{BRICKS_IN_FLIGHT, Brick};
@@ -154,10 +154,10 @@ fn read_runs(grids: &mut [GridBricks], codec: Codec, textures: &[Texture]) -> io
         let ids: Vec<u32> = run.iter().map(id).collect();
         match KeptCodec::of(codec) {
             Some(kept) => {
-                let texels = allocation.encodings.texels(&ids, kept)?;
-                runs.extend(ids.iter().zip(texels).map(|(&id, (bytes, axis))| {
-                    let norm = allocation.encodings.cost(id, kept).map(|cost| cost.norm);
-                    (index, Run::Encoded(Encoded { bytes, axis, norm }))
+                let Tried { costs, bytes, axes } = allocation.encodings.texels(&ids, kept)?;
+                let each = bytes.chunks_exact(codec.layout().brick_bytes()).zip(costs).zip(axes);
+                runs.extend(each.map(|((bytes, cost), axis)| {
+                    (index, Run::Encoded(Encoded { bytes: bytes.to_vec(), axis, norm: Some(cost.norm) }))
                 }));
             }
             None => {

@@ -90,16 +90,38 @@ impl Node {
     }
 }
 
-/// One distinct 8³ region.
+/// One distinct 8³ region, in 12 bytes: there is one for each brick of a sequence.
 #[derive(Clone, Copy, Debug)]
 pub struct Record {
-    /// The place of its mask in [`SequenceTree::masks`]; `None` where a voxel is active if its value is
-    /// not the background.
-    pub mask: Option<u32>,
+    mask: u32,
+    /// A value's bits, or a brick.
+    word: u32,
+    is_brick: bool,
     /// What its inactive voxels are.
     pub rule: InactiveRule,
+}
+
+impl Record {
+    const NO_MASK: u32 = u32::MAX;
+
+    fn new(mask: Option<u32>, rule: InactiveRule, payload: Payload) -> Self {
+        let (is_brick, word) = match payload {
+            Payload::Constant(value) => (false, value.to_bits()),
+            Payload::Brick(id) => (true, id),
+        };
+        Self { mask: mask.unwrap_or(Self::NO_MASK), word, is_brick, rule }
+    }
+
+    /// The place of its mask in [`SequenceTree::masks`]; `None` where a voxel is active if its value is
+    /// not the background.
+    pub fn mask(&self) -> Option<u32> {
+        (self.mask != Self::NO_MASK).then_some(self.mask)
+    }
+
     /// What its other voxels are.
-    pub payload: Payload,
+    pub fn payload(&self) -> Payload {
+        if self.is_brick { Payload::Brick(self.word) } else { Payload::Constant(f32::from_bits(self.word)) }
+    }
 }
 
 /// The values of a [`Record`].
@@ -134,24 +156,33 @@ pub enum DedupError {
 impl SequenceTree {
     /// An empty sequence. `fetch` gives the voxels of frames that are added without; it is not needed where all have
     /// theirs.
-    ///
-    /// # Errors
-    /// When no scratch file can be made.
-    pub fn new(fetch: Option<Box<Fetch>>) -> io::Result<Self> {
-        Ok(Self {
+    pub fn new(fetch: Option<Box<Fetch>>) -> Self {
+        Self {
             background: 0.0,
             frames: Vec::new(),
             nodes: Interner::default(),
             runs: Interner::default(),
             records: Vec::new(),
             masks: Interner::default(),
-            pool: BrickPool::new()?,
+            pool: BrickPool::default(),
             brick_ranges: Vec::new(),
             own_bricks: Vec::new(),
             fetch,
             record_of_brick: Vec::new(),
             record_of_constant: HashMap::new(),
-        })
+        }
+    }
+
+    /// Forgets what only [`SequenceTree::add`] needs: there will be no more frames.
+    pub fn seal(&mut self) {
+        self.record_of_brick = Vec::new();
+        self.record_of_constant = HashMap::new();
+        self.records.shrink_to_fit();
+        self.brick_ranges.shrink_to_fit();
+        self.nodes.seal();
+        self.runs.seal();
+        self.masks.seal();
+        self.pool.seal();
     }
 
     /// Adds the next frame, and where they are at hand its voxels.
@@ -173,7 +204,7 @@ impl SequenceTree {
                         node.children[usize::from(place) >> 6] |= 1 << (place & 63);
                         run.push(match child {
                             Child::Constant(constant) => self.constant_region(constant),
-                            Child::Brick(brick) => self.brick(brick, &outline.bricks[brick as usize]),
+                            Child::Brick(brick) => self.brick(brick, &outline.bricks[brick as usize])?,
                         });
                     }
                     node.run = self.runs.intern(&run).into();
@@ -202,11 +233,16 @@ impl SequenceTree {
 
     /// The same for voxels that were fetched for an outline from elsewhere: they must be those that it tells of.
     fn put_fetched(&mut self, frame: usize, voxels: &[Brick]) -> io::Result<()> {
-        let own = self.own_bricks[frame].clone();
+        let own: Vec<u32> = self.own_bricks[frame].clone().collect();
+        let digests = self.pool.digests(&own)?;
         let pool = &self.pool;
-        let is_told =
-            |id: u32| voxels.get(pool.home(id).brick as usize).is_some_and(|b| pool.is_digest_of(id, b));
-        if !own.into_par_iter().all(is_told) {
+        let is_told = |(&id, digest): (&u32, &[u8; 32])| {
+            voxels.get(pool.home(id).brick as usize).is_some_and(|brick| {
+                let brick = Brick { keeps_mask: pool.keeps_mask(id), ..brick.clone() };
+                BrickPool::digest(&brick) == *digest
+            })
+        };
+        if !own.par_iter().zip(&digests).all(is_told) {
             return Err(Error::Misled("the outline of a frame is not its own".to_owned()).into());
         }
         self.put_voxels(frame, voxels)
@@ -256,32 +292,32 @@ impl SequenceTree {
         let next = self.records.len() as u32;
         let id = *self.record_of_constant.entry((value.to_bits(), mask, rule)).or_insert(next);
         if id == next {
-            self.records.push(Record { mask, rule, payload: Payload::Constant(value) });
+            self.records.push(Record::new(mask, rule, Payload::Constant(value)));
         }
         id
     }
 
     /// The record of a brick of the frame that is being added.
-    fn brick(&mut self, place: u32, outline: &BrickOutline) -> u32 {
+    fn brick(&mut self, place: u32, outline: &BrickOutline) -> io::Result<u32> {
         let &BrickOutline { ref active, keeps_mask, rule, values, .. } = outline;
         let (range, digest) = match values {
             Values::Constant(value) => {
                 let mask = self.mask(outline);
-                return self.constant_record(value, mask, rule);
+                return Ok(self.constant_record(value, mask, rule));
             }
             Values::Varied(range, digest) => (range, digest),
         };
         let home = Home { frame: self.frames.len() as u32, brick: place };
-        let (id, is_new) = self.pool.insert(&digest, active, keeps_mask, home);
+        let (id, is_new) = self.pool.insert(&digest, active, keeps_mask, home)?;
         if !is_new {
-            return self.record_of_brick[id as usize];
+            return Ok(self.record_of_brick[id as usize]);
         }
         let mask = self.mask(outline);
         let record = self.records.len() as u32;
-        self.records.push(Record { mask, rule, payload: Payload::Brick(id) });
+        self.records.push(Record::new(mask, rule, Payload::Brick(id)));
         self.record_of_brick.push(record);
         self.brick_ranges.push(range);
-        record
+        Ok(record)
     }
 
     fn mask(&mut self, outline: &BrickOutline) -> Option<u32> {
@@ -294,7 +330,7 @@ impl SequenceTree {
     /// The inactive rule of each brick of the pool.
     pub fn brick_rules(&self) -> Vec<InactiveRule> {
         // Records of bricks are made in the order of the pool.
-        let of_brick = self.records.iter().filter(|r| matches!(r.payload, Payload::Brick(_)));
+        let of_brick = self.records.iter().filter(|r| matches!(r.payload(), Payload::Brick(_)));
         of_brick.map(|r| r.rule).collect()
     }
 
@@ -305,7 +341,7 @@ impl SequenceTree {
             CellRef::Constant(_) => None,
         });
         let records = nodes.flat_map(|node| node.entries(&self.runs)).map(|&r| &self.records[r as usize]);
-        records.filter_map(|record| match record.payload {
+        records.filter_map(|record| match record.payload() {
             Payload::Brick(id) => Some(id),
             Payload::Constant(_) => None,
         })
@@ -320,7 +356,7 @@ impl SequenceTree {
             let mut left = Node { children: [0; 64], run: 0 };
             run.clear();
             for (place, &record) in bits(&node.children).zip(node.entries(&runs)) {
-                if !matches!(self.records[record as usize].payload, Payload::Brick(id) if is_empty(id)) {
+                if !matches!(self.records[record as usize].payload(), Payload::Brick(id) if is_empty(id)) {
                     left.children[place >> 6] |= 1 << (place & 63);
                     run.push(record);
                 }

@@ -18,8 +18,8 @@ use crate::interrupt;
 use crate::settings::RangeMode;
 use crate::volume::{BRICK_VOXELS, BRICKS_IN_FLIGHT, Brick, InactiveRule, Mask512};
 use cached::Batches;
-pub use cached::{Batch, GridCache, active};
-use kept::KeptTexels;
+pub use cached::{Batch, GridCache};
+use kept::{Kept, Note};
 use measure::Measure;
 
 /// What one codec does to one brick.
@@ -100,6 +100,23 @@ impl KeptCodec {
             Self::Unorm8 => Codec::Unorm8,
         }
     }
+
+    /// Bytes of a brick's texels.
+    fn brick_bytes(self) -> usize {
+        self.codec().layout().brick_bytes()
+    }
+}
+
+impl Plain {
+    fn to_notes(&self) -> [Note; 3] {
+        let value = self.value.to_bits();
+        [Note::new(self.constant, value), Note::new(self.empty, 0), Note::new(self.f16, 0)]
+    }
+
+    fn from_notes([constant, empty, f16]: [Note; 3]) -> Self {
+        let value = f32::from_bits(constant.word);
+        Self { value, constant: constant.cost(), empty: empty.cost(), f16: f16.cost() }
+    }
 }
 
 /// What the error of a grid's bricks depends on beside the bricks.
@@ -127,8 +144,8 @@ pub struct Encodings {
     pub ranges: Vec<BrickRange>,
     terms: Terms,
     rules: Vec<InactiveRule>,
-    plain: Vec<Option<Plain>>,
-    kept: [KeptTexels; KeptCodec::ALL.len()],
+    plain: Kept<3>,
+    kept: [Kept<1>; KeptCodec::ALL.len()],
     batches: Batches,
     saved: Instant,
 }
@@ -148,8 +165,8 @@ impl Encodings {
         let batches = Batches::new(tree, cache, &sequence, &terms);
         Some(Self {
             rules: tree.brick_rules(),
-            plain: vec![None; ranges.len()],
-            kept: KeptCodec::ALL.map(|codec| KeptTexels::new(codec.codec())),
+            plain: Kept::new(0),
+            kept: KeptCodec::ALL.map(|codec| Kept::new(codec.brick_bytes())),
             batches,
             saved: Instant::now(),
             sequence,
@@ -158,22 +175,34 @@ impl Encodings {
         })
     }
 
-    /// What a brick would be without texels; `None` while it has not been tried.
-    pub fn plain(&self, id: u32) -> Option<&Plain> {
-        self.plain[id as usize].as_ref()
-    }
-
-    /// What a codec does to a brick; `None` while it has not been tried.
-    pub fn cost(&self, id: u32, codec: KeptCodec) -> Option<Cost> {
-        self.kept[codec as usize].cost(id)
-    }
-
-    /// The texels of some bricks in a codec that was tried on all of them, with their packing axes.
+    /// What some bricks, which were tried, would be without texels.
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn texels(&mut self, ids: &[u32], codec: KeptCodec) -> io::Result<Vec<(Vec<u8>, u8)>> {
-        self.kept[codec as usize].read(ids)
+    pub fn plain(&mut self, ids: &[u32]) -> io::Result<Vec<Plain>> {
+        Ok(self.plain.notes(ids)?.into_iter().map(Plain::from_notes).collect())
+    }
+
+    /// What a codec does to some bricks that it was tried on.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be read back.
+    pub fn costs(&mut self, ids: &[u32], codec: KeptCodec) -> io::Result<Vec<Cost>> {
+        Ok(self.kept[codec as usize].notes(ids)?.into_iter().map(|[note]| note.cost()).collect())
+    }
+
+    /// What a codec made of some bricks that it was tried on.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be read back.
+    pub fn texels(&mut self, ids: &[u32], codec: KeptCodec) -> io::Result<Tried> {
+        let kept = &mut self.kept[codec as usize];
+        let notes = kept.notes(ids)?;
+        Ok(Tried {
+            costs: notes.iter().map(|[note]| note.cost()).collect(),
+            bytes: kept.texels(ids)?,
+            axes: notes.iter().map(|[note]| note.word as u8).collect(),
+        })
     }
 
     /// Whether a brick's texels give all of its voxels.
@@ -194,8 +223,8 @@ impl Encodings {
 
     fn is_known(&self, id: u32, kind: Kind) -> bool {
         match kind {
-            Kind::Plain => self.plain(id).is_some(),
-            Kind::Texels(codec) => self.cost(id, codec).is_some(),
+            Kind::Plain => self.plain.is_known(id),
+            Kind::Texels(codec) => self.kept[codec as usize].is_known(id),
         }
     }
 
@@ -232,9 +261,7 @@ impl Encodings {
                 .map(|(ids, bricks)| self.make_batch(shared, ids, bricks, kinds))
                 .collect();
             for (ids, made) in missing.chunks(batch).zip(made) {
-                for (made, &kind) in made.into_iter().zip(kinds) {
-                    self.keep(ids, kind, made)?;
-                }
+                made.into_iter().try_for_each(|made| self.keep(ids, made))?;
             }
             for &kind in kinds {
                 self.batches.mark(&missing, kind);
@@ -252,7 +279,7 @@ impl Encodings {
         let each = || ids.iter().zip(bricks).zip(&texels);
         let made = |kind: &Kind| match *kind {
             Kind::Plain => Made::Plain(each().map(|((&id, b), t)| self.make_plain(tree, id, b, t)).collect()),
-            Kind::Texels(codec) => Made::Texels(self.make_texels(codec.codec(), bricks, &texels)),
+            Kind::Texels(codec) => Made::Texels(codec, self.make_texels(codec.codec(), bricks, &texels)),
         };
         kinds.iter().map(made).collect()
     }
@@ -289,33 +316,35 @@ impl Encodings {
         Tried { costs: each.map(cost).collect(), bytes: encoded.bytes, axes: encoded.axes }
     }
 
-    fn keep(&mut self, ids: &[u32], kind: Kind, made: Made) -> io::Result<()> {
-        match (kind, made) {
-            (Kind::Texels(codec), Made::Texels(Tried { costs, bytes, axes })) => {
-                self.kept[codec as usize].add(ids, &costs, &bytes, &axes)
+    fn keep(&mut self, ids: &[u32], made: Made) -> io::Result<()> {
+        match made {
+            Made::Texels(codec, tried) => {
+                let note = |(&cost, &axis)| [Note::new(cost, u32::from(axis))];
+                let notes: Vec<_> = tried.costs.iter().zip(&tried.axes).map(note).collect();
+                self.kept[codec as usize].add(self.ranges.len(), ids, &notes, &tried.bytes)
             }
-            (_, Made::Plain(plain)) => {
-                self.keep_plain(ids, &plain);
-                Ok(())
-            }
-            (Kind::Plain, Made::Texels(_)) => unreachable!("plain bricks have no texels"),
+            Made::Plain(plain) => self.keep_plain(ids, &plain),
         }
     }
 
-    fn keep_plain(&mut self, ids: &[u32], plain: &[Plain]) {
-        ids.iter().zip(plain).for_each(|(&id, plain)| self.plain[id as usize] = Some(*plain));
+    fn keep_plain(&mut self, ids: &[u32], plain: &[Plain]) -> io::Result<()> {
+        let notes: Vec<_> = plain.iter().map(Plain::to_notes).collect();
+        self.plain.add(self.ranges.len(), ids, &notes, &[])
     }
 }
 
 /// What was made of a batch, in the order of its bricks.
 enum Made {
     Plain(Vec<Plain>),
-    Texels(Tried),
+    Texels(KeptCodec, Tried),
 }
 
-/// A batch that one codec was tried on.
-struct Tried {
-    costs: Vec<Cost>,
-    bytes: Vec<u8>,
-    axes: Vec<u8>,
+/// What a codec made of some bricks.
+pub struct Tried {
+    /// What it does to each.
+    pub costs: Vec<Cost>,
+    /// Their texels, one after another.
+    pub bytes: Vec<u8>,
+    /// Their packing axes.
+    pub axes: Vec<u8>,
 }
