@@ -174,7 +174,11 @@ impl BrickPool {
         self.values.read(&slots, |values| {
             let (&id, facts) = each.next().expect("each brick has facts and values");
             let keeps_mask = self.bricks[id as usize].keeps_mask;
-            out.push(Brick { values: bytemuck::pod_read_unaligned(values), active: facts.active, keeps_mask });
+            out.push(Brick {
+                values: bytemuck::pod_read_unaligned(values),
+                active: facts.active,
+                keeps_mask,
+            });
         })
     }
 }

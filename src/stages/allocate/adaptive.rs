@@ -52,7 +52,7 @@ pub fn adaptive(
             searches.iter_mut().map(|s| s.at_psnr(db, floor, advance)).collect::<io::Result<_>>()?
         }
         Quality::MaxError(bound) => {
-            let within = |s: &mut GridSearch| s.within(bound.absolute(s.peak, s.voxel_size), advance);
+            let within = |s: &mut GridSearch| s.within(bound.absolute(s.table.peak, s.voxel_size), advance);
             searches.iter_mut().map(within).collect::<io::Result<_>>()?
         }
         Quality::BitsPerVoxel(bits) => {

@@ -6,14 +6,13 @@
 //! counts as one that it serves without error: whoever prefers something else even then never needs it, and whoever
 //! chooses it is tried and the search goes on with what was found.
 
-use std::collections::HashMap;
 use std::io;
 use std::sync::LazyLock;
 
 use rayon::prelude::*;
 
 use super::adaptive::AdaptiveGrid;
-use super::choices::{Choices, bits, costs};
+use super::choices::{Table, costs};
 use super::rung::Rung;
 use super::share::{Loan, loans};
 use super::{Allocation, Coding, Shape};
@@ -51,23 +50,14 @@ pub(super) struct GridSearch<'a> {
     pub(super) tree: &'a mut SequenceTree,
     encodings: Encodings,
     pub(super) voxel_size: f64,
-    /// How often each brick is used over all frames.
-    uses: Vec<u32>,
-    /// How many L3 records each brick has: one in every run that it is in.
-    pub(super) records: Vec<u32>,
+    pub(super) table: Table,
     /// The coarsest step that each brick may have, for the sake of the frames it is in.
     pub(super) least_step: Vec<u32>,
-    choices: Vec<Choices>,
     /// The bricks that this search asked for in BC7. A cache may know of more, but what it knows by chance must not
     /// lead the search elsewhere.
     bc7_is_tried: Vec<bool>,
-    /// What bricks may borrow, and which have a loan.
-    loans: HashMap<u32, Loan>,
-    has_loan: Vec<bool>,
     /// The rung of bricks that lend their texels.
     lends: Vec<Option<Rung>>,
-    /// Maximum less minimum of active values.
-    pub(super) peak: f64,
     active_voxels: u64,
 }
 
@@ -86,39 +76,23 @@ impl<'a> GridSearch<'a> {
         }
         let peak = tree.active_range().map_or(0.0, ValueRange::width);
         let mut search = Self {
-            choices: vec![Choices::NONE; uses.len()],
             least_step: vec![0; uses.len()],
             bc7_is_tried: vec![false; uses.len()],
-            loans: HashMap::new(),
-            has_loan: vec![false; uses.len()],
             lends: vec![None; uses.len()],
-            peak,
             active_voxels: tree.frames.iter().map(|f| f.stats.active_leaf_voxels).sum(),
             voxel_size: grid.voxel_size,
-            uses,
-            records,
+            table: Table::new(uses, records, peak),
             encodings: grid.encodings,
             tree,
         };
-        let all: Vec<u32> = (0..search.uses.len() as u32).collect();
+        let all: Vec<u32> = (0..search.table.len() as u32).collect();
         for ids in all.chunks(BRICKS_IN_FLIGHT as usize) {
-            for (&id, (costs, _)) in ids.iter().zip(costs(&mut search.encodings, ids, &search.bc7_is_tried)?) {
-                Rung::ALL.into_iter().for_each(|rung| search.weigh(id, rung, costs[rung as usize]));
+            for (&id, (costs, _)) in ids.iter().zip(costs(&mut search.encodings, ids, &search.bc7_is_tried)?)
+            {
+                Rung::ALL.into_iter().for_each(|rung| search.table.weigh(id, rung, costs[rung as usize]));
             }
         }
         Ok(search)
-    }
-
-    /// Notes what a rung comes to for a brick.
-    fn weigh(&mut self, id: u32, rung: Rung, cost: Cost) {
-        let distortion = self.in_peaks(cost.norm) * f64::from(self.uses[id as usize]);
-        let active_squares = self.in_peaks(cost.active_norm);
-        self.choices[id as usize].set(rung, distortion, active_squares);
-    }
-
-    fn end_loan(&mut self, id: u32) {
-        self.loans.remove(&id);
-        self.has_loan[id as usize] = false;
     }
 
     /// The squared peaks that `voxels` may err by together at some PSNR.
@@ -128,45 +102,8 @@ impl<'a> GridSearch<'a> {
 
     /// The PSNR of so many squared peaks. Without a peak there is none above any error.
     fn psnr(&self, voxels: u64, squares: f64) -> f64 {
-        let voxels = if self.peak > 0.0 { voxels as f64 } else { 0.0 };
+        let voxels = if self.table.peak > 0.0 { voxels as f64 } else { 0.0 };
         10.0 * (voxels / squares).log10()
-    }
-
-    /// A brick's error in squared peaks, over all its users and over all the voxels that its texels give. That of a
-    /// codec that was not tried is none.
-    fn distortion(&self, brick: usize, rung: Rung) -> f64 {
-        match rung {
-            Rung::Borrowed => self.loan(brick).map_or(f64::INFINITY, |loan| {
-                self.in_peaks(loan.cost.norm) * f64::from(self.uses[brick])
-            }),
-            rung => self.choices[brick].distortion(rung),
-        }
-    }
-
-    /// The same for one user, over active voxels.
-    fn active_squares(&self, brick: usize, rung: Rung) -> f64 {
-        match rung {
-            Rung::Borrowed => {
-                self.loan(brick).map_or(f64::INFINITY, |loan| self.in_peaks(loan.cost.active_norm))
-            }
-            rung => self.choices[brick].active_squares(rung),
-        }
-    }
-
-    fn loan(&self, brick: usize) -> Option<&Loan> {
-        // Most have none, and a look at a flag is less than one into a table.
-        if self.has_loan[brick] { self.loans.get(&(brick as u32)) } else { None }
-    }
-
-    fn in_peaks(&self, norm: f64) -> f64 {
-        // Where all active values are the same, nothing but no error will do.
-        let peak = if self.peak > 0.0 { self.peak } else { f64::MIN_POSITIVE };
-        if norm == 0.0 { 0.0 } else { (norm / peak) * (norm / peak) }
-    }
-
-    /// The bits of a brick's texels and of all its records.
-    fn bits(&self, brick: usize, rung: Rung) -> f64 {
-        bits(rung, self.records[brick])
     }
 
     /// The rung with the least D + λR; of equals the cheapest.
@@ -177,13 +114,13 @@ impl<'a> GridSearch<'a> {
         let step = step.max(self.least_step[brick]);
         if step == 0 {
             // The coarsest there is: no error is too large.
-            let possible = |rung: &Rung| self.distortion(brick, *rung).is_finite();
+            let possible = |rung: &Rung| self.table.distortion(brick, *rung).is_finite();
             return Rung::ALL.into_iter().find(possible).unwrap_or(Rung::F32);
         }
         let lambda = lambda(step);
         let (mut best, mut least) = (Rung::F32, f64::INFINITY);
         for rung in Rung::ALL {
-            let cost = self.distortion(brick, rung) + lambda * self.bits(brick, rung);
+            let cost = self.table.distortion(brick, rung) + lambda * self.table.bits(brick, rung);
             if cost < least {
                 (best, least) = (rung, cost);
             }
@@ -192,13 +129,14 @@ impl<'a> GridSearch<'a> {
     }
 
     pub(super) fn picks(&self, step: u32) -> Vec<Rung> {
-        (0..self.uses.len()).into_par_iter().map(|brick| self.pick(brick, step)).collect()
+        (0..self.table.len()).into_par_iter().map(|brick| self.pick(brick, step)).collect()
     }
 
     /// The squared error of all frames over active voxels, summed in the order of the bricks.
     pub(super) fn squares(&self, picks: &[Rung]) -> f64 {
         let each = picks.iter().enumerate();
-        each.map(|(brick, &rung)| f64::from(self.uses[brick]) * self.active_squares(brick, rung)).sum()
+        each.map(|(brick, &rung)| f64::from(self.table.uses[brick]) * self.table.active_squares(brick, rung))
+            .sum()
     }
 
     /// Tries what was picked without having been tried. Whether there was any.
@@ -213,7 +151,7 @@ impl<'a> GridSearch<'a> {
         for ids in unknown.chunks(BRICKS_IN_FLIGHT as usize) {
             for (&id, cost) in ids.iter().zip(self.encodings.costs(ids, KeptCodec::Bc7)?) {
                 self.bc7_is_tried[id as usize] = true;
-                self.weigh(id, Rung::Bc7, cost);
+                self.table.weigh(id, Rung::Bc7, cost);
             }
         }
         Ok(!unknown.is_empty())
@@ -229,7 +167,7 @@ impl<'a> GridSearch<'a> {
         self.find_loans(&alone, step, advance)?;
         let (_, together) = self.at_psnr_with_loans(psnr, floor, advance)?;
         let bits =
-            |picks: &[Rung]| (0..).zip(picks).map(|(brick, &rung)| self.bits(brick, rung)).sum::<f64>();
+            |picks: &[Rung]| (0..).zip(picks).map(|(brick, &rung)| self.table.bits(brick, rung)).sum::<f64>();
         if bits(&together) < bits(&alone) {
             return Ok(together);
         }
@@ -256,9 +194,9 @@ impl<'a> GridSearch<'a> {
                 if squares <= allowed {
                     break;
                 }
-                let (brick, uses) = (switch.brick, f64::from(self.uses[switch.brick]));
-                squares -= uses * self.active_squares(brick, picks[brick]);
-                squares += uses * self.active_squares(brick, switch.to);
+                let (brick, uses) = (switch.brick, f64::from(self.table.uses[switch.brick]));
+                squares -= uses * self.table.active_squares(brick, picks[brick]);
+                squares += uses * self.table.active_squares(brick, switch.to);
                 picks[brick] = switch.to;
             }
             // Differences were added up; the sum itself decides.
@@ -278,8 +216,9 @@ impl<'a> GridSearch<'a> {
         let coarser = self.picks(step.saturating_sub(SLACK_STEPS));
         let (before, mut squares) = (picks.to_vec(), self.squares(picks));
         for switch in switches(0, self, &coarser, &before).into_iter().rev() {
-            let (brick, uses) = (switch.brick, f64::from(self.uses[switch.brick]));
-            let more = self.active_squares(brick, coarser[brick]) - self.active_squares(brick, picks[brick]);
+            let (brick, uses) = (switch.brick, f64::from(self.table.uses[switch.brick]));
+            let more = self.table.active_squares(brick, coarser[brick])
+                - self.table.active_squares(brick, picks[brick]);
             if squares + uses * more <= allowed {
                 squares += uses * more;
                 picks[brick] = coarser[brick];
@@ -308,32 +247,28 @@ impl<'a> GridSearch<'a> {
         // Who may borrow, and of those who has texels that others can use.
         let whole: Vec<bool> = (0..picks.len() as u32).map(|id| self.encodings.is_whole(id)).collect();
         let borrows = |id: u32| whole[id as usize] && compared[id as usize] != Rung::Empty;
-        let lends = |id: u32| {
-            borrows(id).then(|| KeptCodec::of(compared[id as usize].codec())).flatten()
-        };
-        let mut offers: Vec<(u32, Loan)> = Vec::new();
-        loans(&mut self.encodings, self.tree, borrows, lends, |id, loans| {
-            let as_compared = |loan: &&Loan| picks[loan.lender as usize] == compared[loan.lender as usize];
-            offers.extend(loans.iter().filter(as_compared).map(|loan| (id, *loan)));
-        })?;
+        let lends = |id: u32| borrows(id).then(|| KeptCodec::of(compared[id as usize].codec())).flatten();
+        let (table, least_step) = (&self.table, &self.least_step);
         let gain = |id: u32, loan: &Loan| {
             let brick = id as usize;
-            let lambda = lambda(step.max(self.least_step[brick]));
-            let own = self.distortion(brick, picks[brick]) + lambda * self.bits(brick, picks[brick]);
-            let borrowed = self.in_peaks(loan.cost.norm) * f64::from(self.uses[brick]);
-            own - borrowed - lambda * self.bits(brick, Rung::Borrowed)
+            let lambda = lambda(step.max(least_step[brick]));
+            let own = table.distortion(brick, picks[brick]) + lambda * table.bits(brick, picks[brick]);
+            let borrowed = table.in_peaks(loan.cost.norm) * f64::from(table.uses[brick]);
+            own - borrowed - lambda * table.bits(brick, Rung::Borrowed)
         };
-        let mut order: Vec<(f64, u32, Loan)> = offers
-            .into_iter()
-            .map(|(id, loan)| (gain(id, &loan), id, loan))
-            .filter(|(gain, ..)| *gain > 0.0)
-            .collect();
+        // A fifth of the bricks has an offer worth taking.
+        let mut order: Vec<(f64, u32, Loan)> = Vec::new();
+        loans(&mut self.encodings, self.tree, borrows, lends, |id, loans| {
+            let as_compared = |loan: &&Loan| picks[loan.lender as usize] == compared[loan.lender as usize];
+            let offers = loans.iter().filter(as_compared).map(|loan| (gain(id, loan), id, *loan));
+            order.extend(offers.filter(|(gain, ..)| *gain > 0.0));
+        })?;
         order.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         for (_, id, loan) in order {
             let (id, lender) = (id as usize, loan.lender as usize);
-            if !self.has_loan[id] && self.lends[id].is_none() && !self.has_loan[lender] {
-                self.loans.insert(id as u32, loan);
-                self.has_loan[id] = true;
+            let table = &mut self.table;
+            if table.loan(id).is_none() && self.lends[id].is_none() && table.loan(lender).is_none() {
+                table.lend(id as u32, loan);
                 self.lends[lender] = Some(picks[lender]);
             }
         }
@@ -341,13 +276,12 @@ impl<'a> GridSearch<'a> {
     }
 
     pub(super) fn forget_loans(&mut self) {
-        self.loans.clear();
-        self.has_loan.fill(false);
+        self.table.forget_loans();
         self.lends.fill(None);
     }
 
     pub(super) fn within(&mut self, bound: f64, advance: &mut dyn FnMut(u64)) -> io::Result<Vec<Rung>> {
-        let all: Vec<u32> = (0..self.uses.len() as u32).collect();
+        let all: Vec<u32> = (0..self.table.len() as u32).collect();
         let fits = |cost: &Cost| cost.norm.is_finite() && f64::from(cost.max) <= bound;
         loop {
             let mut picks = Vec::with_capacity(all.len());
@@ -371,7 +305,7 @@ impl<'a> GridSearch<'a> {
     /// That of the worst frame.
     pub(super) fn worst_frame(&self, picks: &[Rung]) -> f64 {
         let frames = self.tree.frames.iter().map(|frame| {
-            let square = |id: u32| self.active_squares(id as usize, picks[id as usize]);
+            let square = |id: u32| self.table.active_squares(id as usize, picks[id as usize]);
             self.psnr(frame.stats.active_leaf_voxels, self.tree.frame_bricks(frame).map(square).sum())
         });
         // Where there is no error, or no voxel to err, there is no worst.
@@ -393,7 +327,7 @@ impl<'a> GridSearch<'a> {
             .filter(|&(f, allowed)| {
                 let bricks = || self.tree.frame_bricks(&self.tree.frames[f]);
                 let squares: f64 =
-                    bricks().map(|id| self.active_squares(id as usize, picks[id as usize])).sum();
+                    bricks().map(|id| self.table.active_squares(id as usize, picks[id as usize])).sum();
                 // What no step meets is met as nearly as the last one does.
                 squares > allowed && bricks().any(|id| self.least_step[id as usize] < LAST_STEP)
             })
@@ -408,7 +342,7 @@ impl<'a> GridSearch<'a> {
                 let squares = |step| -> f64 {
                     bricks
                         .iter()
-                        .map(|&id| self.active_squares(id as usize, self.pick(id as usize, step)))
+                        .map(|&id| self.table.active_squares(id as usize, self.pick(id as usize, step)))
                         .sum()
                 };
                 let step = first_step(|step| squares(step) <= allowed);
@@ -434,26 +368,31 @@ impl<'a> GridSearch<'a> {
         Ok(!low.is_empty())
     }
 
-    /// Ends every loan that some bricks are part of: they are to become finer, and their texels others.
+    /// Ends every loan that some bricks, ascending, are part of: they are to become finer, and their texels others.
     fn call_in_loans(&mut self, bricks: &[u32]) {
         for &id in bricks {
-            self.end_loan(id);
             self.lends[id as usize] = None;
         }
-        let lends = |loan: &Loan| self.lends[loan.lender as usize].is_some();
-        let ended: Vec<u32> = self.loans.iter().filter(|(_, loan)| !lends(loan)).map(|(&id, _)| id).collect();
-        ended.into_iter().for_each(|id| self.end_loan(id));
+        let lends = &self.lends;
+        self.table.keep_loans(|id, loan| {
+            lends[loan.lender as usize].is_some() && bricks.binary_search(&id).is_err()
+        });
     }
 
     pub(super) fn finish(self, picks: &[Rung]) -> io::Result<Allocation> {
-        let Self { tree, mut encodings, bc7_is_tried, loans, choices, .. } = self;
-        drop(choices);
+        let Self { tree, mut encodings, bc7_is_tried, table, .. } = self;
+        let loans = table.into_loans();
         let all: Vec<u32> = (0..picks.len() as u32).collect();
         let (mut norms, mut codings) = (Vec::with_capacity(all.len()), Vec::with_capacity(all.len()));
         for ids in all.chunks(BRICKS_IN_FLIGHT as usize) {
             for (&id, (costs, value)) in ids.iter().zip(costs(&mut encodings, ids, &bc7_is_tried)?) {
                 let rung = picks[id as usize];
-                norms.push(loans.get(&id).filter(|_| rung == Rung::Borrowed).map_or(costs[rung as usize].norm, |l| l.cost.norm));
+                norms.push(
+                    loans
+                        .get(&id)
+                        .filter(|_| rung == Rung::Borrowed)
+                        .map_or(costs[rung as usize].norm, |l| l.cost.norm),
+                );
                 codings.push(match rung {
                     Rung::Empty | Rung::Borrowed => Coding::Empty,
                     Rung::Constant => Coding::Constant(value),
@@ -518,8 +457,13 @@ pub(super) fn switches(grid: usize, search: &GridSearch, coarse: &[Rung], fine: 
     let mut switches: Vec<Switch> = differ
         .map(|brick| {
             let (from, to) = (coarse[brick], fine[brick]);
-            let less = search.distortion(brick, from) - search.distortion(brick, to);
-            Switch { grid, brick, to, gain: less / (search.bits(brick, to) - search.bits(brick, from)) }
+            let less = search.table.distortion(brick, from) - search.table.distortion(brick, to);
+            Switch {
+                grid,
+                brick,
+                to,
+                gain: less / (search.table.bits(brick, to) - search.table.bits(brick, from)),
+            }
         })
         .collect();
     switches.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.brick.cmp(&b.brick)));

@@ -160,8 +160,7 @@ impl Comparison {
         let borrowers: Vec<(u32, u64)> =
             self.borrowers.iter().map(|&id| (place(id), tree.pool.active_hash(id))).collect();
         // Places are told from each other by the batch that they are in.
-        let counts: Vec<usize> =
-            batches.iter().map(|batch| count(&self.lenders, &batch.ids)).collect();
+        let counts: Vec<usize> = batches.iter().map(|batch| count(&self.lenders, &batch.ids)).collect();
         let lenders: Vec<(u32, KeptCodec)> =
             self.lenders.iter().map(|&(id, codec)| (place(id), codec)).collect();
         Some(Key::new(&STAGE, &(keys?, self.batch - self.around.start, borrowers, counts, lenders)))

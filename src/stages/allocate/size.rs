@@ -155,7 +155,7 @@ fn texel_bytes(counts: &[u32; Rung::ALL.len()]) -> u64 {
 /// What empty bricks do without: their records, and nodes of which nothing is left.
 fn saved_bytes(searches: &[GridSearch], picks: &[Vec<Rung>]) -> u64 {
     let of_grid = |(search, picks): (&GridSearch, &Vec<Rung>)| {
-        let empty = picks.iter().zip(&search.records).filter(|(rung, _)| **rung == Rung::Empty);
+        let empty = picks.iter().zip(&search.table.records).filter(|(rung, _)| **rung == Rung::Empty);
         let records: u64 = empty.map(|(_, records)| u64::from(*records) * u64::from(RECORD_BITS / 8)).sum();
         let tree = &*search.tree;
         let is_empty = |&record: &u32| match tree.records[record as usize].payload() {
