@@ -59,7 +59,7 @@ pub(super) fn read(
             progress.advance(1);
         }
     }
-    grids.iter_mut().for_each(|grid| grid.tree.seal());
+    grids.iter_mut().try_for_each(|grid| grid.tree.seal()).map_err(scratch)?;
     Ok(grids)
 }
 

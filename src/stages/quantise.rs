@@ -59,7 +59,7 @@ enum Run {
     /// One slot's texels, which are there already.
     Encoded(Encoded),
     /// Bricks of one grid, by their numbers in its pool.
-    Bricks(Vec<u32>, Vec<Brick>),
+    Bricks(Vec<u32>),
 }
 
 /// One brick's texels, encoded.
@@ -161,9 +161,8 @@ fn read_runs(grids: &mut [GridBricks], codec: Codec, textures: &[Texture]) -> io
                 }));
             }
             None => {
-                let mut bricks = Vec::with_capacity(ids.len());
-                tree.read(&ids, &mut bricks)?;
-                runs.push((index, Run::Bricks(ids, bricks)));
+                tree.fetch(&ids)?;
+                runs.push((index, Run::Bricks(ids)));
             }
         }
     }
@@ -179,10 +178,13 @@ fn encode_slab(
     for (grid, run) in runs {
         match run {
             Run::Encoded(encoded) => out.push(encoded),
-            Run::Bricks(ids, bricks) => out.extend(
-                encode_bricks(codec, &grids[grid], &ids, &bricks)
-                    .map_err(|source| QuantiseError::OutOfRange { grid, source })?,
-            ),
+            Run::Bricks(ids) => {
+                let bricks = grids[grid].tree.pool.read(&ids)?;
+                out.extend(
+                    encode_bricks(codec, &grids[grid], &ids, &bricks)
+                        .map_err(|source| QuantiseError::OutOfRange { grid, source })?,
+                );
+            }
         }
     }
     Ok(out)

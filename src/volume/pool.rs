@@ -8,7 +8,7 @@ use xxhash_rust::xxh3::{xxh3_64, xxh3_128};
 
 use super::{BRICK_VOXELS, Brick, Mask512, Scratch};
 
-/// Bricks that are read back at a time: 8 MB of voxels, enough batches of an encoder for every core.
+/// Bricks that are worked on before what was made of them is put away: enough batches of an encoder for every core.
 pub const BRICKS_IN_FLIGHT: u32 = 4096;
 
 /// Where a brick comes from.
@@ -25,11 +25,15 @@ pub struct Home {
 /// A brick may be known before its values are: they are put in when someone has need of them. Memory is about 25
 /// bytes a unique brick, and 40 to 80 more until [`BrickPool::seal`]; voxels, masks and digests are in scratch files.
 pub struct BrickPool {
-    by_digest: HashMap<[u8; 32], u32>,
+    by_digest: HashMap<Key, u32>,
     bricks: Vec<Known>,
     facts: Scratch,
     values: Scratch,
 }
+
+/// Half of a digest tells bricks apart as well: nobody has ever found two texts of one either, and while frames are
+/// added the table is the largest thing that grows with them.
+type Key = [u8; 16];
 
 /// What is asked of a brick all the time.
 struct Known {
@@ -100,7 +104,8 @@ impl BrickPool {
         home: Home,
     ) -> io::Result<(u32, bool)> {
         let next = self.bricks.len() as u32;
-        let id = *self.by_digest.entry(*digest).or_insert(next);
+        let key = *digest.first_chunk().expect("a digest is 32 bytes");
+        let id = *self.by_digest.entry(key).or_insert(next);
         if id == next {
             self.bricks.push(Known { home, slot: NOWHERE, keeps_mask, active: hash(active) });
             self.facts.append(bytemuck::bytes_of(&Facts { active: *active, digest: *digest }))?;
@@ -110,6 +115,7 @@ impl BrickPool {
         // active in any of them.
         let known = &mut self.bricks[id as usize];
         if known.active != hash(active) {
+            self.facts.flush()?;
             let mut facts: Facts = self.facts.read_as(&[id])?[0];
             facts.active = facts.active.union(active);
             known.active = hash(&facts.active);
@@ -119,16 +125,29 @@ impl BrickPool {
     }
 
     /// Forgets what only [`BrickPool::insert`] needs: there will be no more bricks.
-    pub fn seal(&mut self) {
+    ///
+    /// # Errors
+    /// When the scratch file cannot be written.
+    pub fn seal(&mut self) -> io::Result<()> {
         self.by_digest = HashMap::new();
         self.bricks.shrink_to_fit();
+        self.facts.flush()?;
+        self.values.flush()
+    }
+
+    /// Sees to it that the values that were put in can be read.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be written.
+    pub fn flush(&mut self) -> io::Result<()> {
+        self.values.flush()
     }
 
     /// The digests that some bricks were inserted with.
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn digests(&mut self, ids: &[u32]) -> io::Result<Vec<[u8; 32]>> {
+    pub fn digests(&self, ids: &[u32]) -> io::Result<Vec<[u8; 32]>> {
         let facts = self.facts.read_as::<Facts>(ids)?;
         Ok(facts.into_iter().map(|facts| facts.digest).collect())
     }
@@ -162,15 +181,15 @@ impl BrickPool {
         self.values.append(bytemuck::bytes_of(values))
     }
 
-    /// Appends some bricks, whose values are there, to `out`.
+    /// Some bricks, whose values are there.
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn read(&mut self, ids: &[u32], out: &mut Vec<Brick>) -> io::Result<()> {
+    pub fn read(&self, ids: &[u32]) -> io::Result<Vec<Brick>> {
+        let mut out = Vec::with_capacity(ids.len());
         let slots: Vec<u32> = ids.iter().map(|&id| self.bricks[id as usize].slot).collect();
         let facts = self.facts.read_as::<Facts>(ids)?;
         let mut each = ids.iter().zip(facts);
-        out.reserve(ids.len());
         self.values.read(&slots, |values| {
             let (&id, facts) = each.next().expect("each brick has facts and values");
             let keeps_mask = self.bricks[id as usize].keeps_mask;
@@ -179,7 +198,8 @@ impl BrickPool {
                 active: facts.active,
                 keeps_mask,
             });
-        })
+        })?;
+        Ok(out)
     }
 }
 

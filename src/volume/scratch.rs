@@ -1,7 +1,7 @@
 //! Records of one size in an unnamed temporary file: what a sequence has too much of to keep in memory.
 
 use std::fs::File;
-use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::io::{self, Seek, SeekFrom, Write};
 
 use bytemuck::Pod;
 
@@ -26,6 +26,11 @@ impl Scratch {
     /// None yet, of that many bytes each.
     pub fn new(record: usize) -> Self {
         Self { record, file: None, buffer: Vec::new(), written: 0 }
+    }
+
+    /// Bytes of each.
+    pub fn record(&self) -> usize {
+        self.record
     }
 
     /// How many there are.
@@ -55,29 +60,49 @@ impl Scratch {
     pub fn replace(&mut self, place: u32, record: &[u8]) -> io::Result<()> {
         self.flush()?;
         let at = self.at(place);
-        let mut file = self.file()?;
-        file.seek(SeekFrom::Start(at))?;
-        file.write_all(record)
+        self.write(at, record)
     }
 
-    /// Visits the records at some places, in that order.
+    /// Writes what was appended, so that it can be read.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn flush(&mut self) -> io::Result<()> {
+        let mut buffer = std::mem::take(&mut self.buffer);
+        if !buffer.is_empty() {
+            self.write(self.at(self.written), &buffer)?;
+            self.written += (buffer.len() / self.record) as u32;
+            buffer.clear();
+            self.buffer = buffer;
+        }
+        Ok(())
+    }
+
+    fn write(&mut self, at: u64, bytes: &[u8]) -> io::Result<()> {
+        let file = match &mut self.file {
+            Some(file) => file,
+            none => none.insert(tempfile::tempfile()?),
+        };
+        file.seek(SeekFrom::Start(at))?;
+        file.write_all(bytes)
+    }
+
+    /// Visits the records at some places, in that order. They must have been flushed. Any number of threads may read.
     ///
     /// # Errors
     /// When the file cannot be read back.
-    pub fn read(&mut self, places: &[u32], mut visit: impl FnMut(&[u8])) -> io::Result<()> {
-        self.flush()?;
-        let (at, record) = (|place: u32| u64::from(place) * self.record as u64, self.record as u64);
-        let near = |a: &u32, b: &u32| b > a && at(*b) - at(*a) <= record + GAP;
+    pub fn read(&self, places: &[u32], mut visit: impl FnMut(&[u8])) -> io::Result<()> {
+        let near = |a: &u32, b: &u32| b > a && self.at(*b) - self.at(*a) <= self.record as u64 + GAP;
         let mut bytes = Vec::new();
         for mut run in places.chunk_by(near) {
             while let Some(&first) = run.first() {
-                let fits = |&&place: &&u32| at(place) - at(first) < BLOCK as u64;
+                let first = self.at(first);
+                let fits = |&&place: &&u32| self.at(place) - first < BLOCK as u64;
                 let (now, later) = run.split_at(run.iter().take_while(fits).count());
-                bytes.resize((at(now[now.len() - 1]) - at(first) + record) as usize, 0);
-                let mut file = self.file.as_ref().expect("places are of records that were appended");
-                file.seek(SeekFrom::Start(at(first)))?;
-                file.read_exact(&mut bytes)?;
-                now.iter().for_each(|&p| visit(&bytes[(at(p) - at(first)) as usize..][..self.record]));
+                bytes.resize((self.at(now[now.len() - 1]) - first) as usize + self.record, 0);
+                let file = self.file.as_ref().expect("records are flushed before they are read");
+                read_at(file, &mut bytes, first)?;
+                now.iter().for_each(|&p| visit(&bytes[(self.at(p) - first) as usize..][..self.record]));
                 run = later;
             }
         }
@@ -88,7 +113,7 @@ impl Scratch {
     ///
     /// # Errors
     /// When the file cannot be read back.
-    pub fn read_as<T: Pod>(&mut self, places: &[u32]) -> io::Result<Vec<T>> {
+    pub fn read_as<T: Pod>(&self, places: &[u32]) -> io::Result<Vec<T>> {
         let mut values = Vec::with_capacity(places.len());
         self.read(places, |record| values.push(bytemuck::pod_read_unaligned(record)))?;
         Ok(values)
@@ -97,28 +122,22 @@ impl Scratch {
     fn at(&self, place: u32) -> u64 {
         u64::from(place) * self.record as u64
     }
+}
 
-    fn file(&mut self) -> io::Result<&File> {
-        match &mut self.file {
-            Some(file) => Ok(file),
-            none => Ok(none.insert(tempfile::tempfile()?)),
+#[cfg(unix)]
+fn read_at(file: &File, bytes: &mut [u8], at: u64) -> io::Result<()> {
+    std::os::unix::fs::FileExt::read_exact_at(file, bytes, at)
+}
+
+#[cfg(windows)]
+fn read_at(file: &File, mut bytes: &mut [u8], mut at: u64) -> io::Result<()> {
+    while !bytes.is_empty() {
+        match std::os::windows::fs::FileExt::seek_read(file, bytes, at)? {
+            0 => return Err(io::ErrorKind::UnexpectedEof.into()),
+            read => (bytes, at) = (&mut bytes[read..], at + read as u64),
         }
     }
-
-    fn flush(&mut self) -> io::Result<()> {
-        if self.buffer.is_empty() {
-            return Ok(());
-        }
-        let at = self.at(self.written);
-        let buffer = std::mem::take(&mut self.buffer);
-        let mut file = self.file()?;
-        file.seek(SeekFrom::Start(at))?;
-        file.write_all(&buffer)?;
-        self.written += (buffer.len() / self.record) as u32;
-        self.buffer = buffer;
-        self.buffer.clear();
-        Ok(())
-    }
+    Ok(())
 }
 
 #[cfg(test)]
@@ -134,6 +153,7 @@ mod tests {
         }
         scratch.replace(7, bytemuck::bytes_of(&70u64)).unwrap();
         scratch.append(bytemuck::bytes_of(&50_000u64)).unwrap();
+        scratch.flush().unwrap();
         assert_eq!(scratch.len(), 50_001);
         let places: Vec<u32> = (0..50_001).step_by(3).chain([7, 50_000, 6, 6, 8]).collect();
         let expected: Vec<u64> = places.iter().map(|&p| if p == 7 { 70 } else { p.into() }).collect();

@@ -140,7 +140,7 @@ impl Table {
 /// What rungs do to some bricks, by [`Rung::ALL`], and [`Rung::Constant`]'s values. What was not tried costs nothing,
 /// and loans are not among it.
 pub(super) fn costs(
-    encodings: &mut Encodings,
+    encodings: &Encodings,
     ids: &[u32],
     bc7_is_tried: &[bool],
 ) -> io::Result<Vec<([Cost; Rung::ALL.len()], f32)>> {

@@ -87,8 +87,7 @@ impl<'a> GridSearch<'a> {
         };
         let all: Vec<u32> = (0..search.table.len() as u32).collect();
         for ids in all.chunks(BRICKS_IN_FLIGHT as usize) {
-            for (&id, (costs, _)) in ids.iter().zip(costs(&mut search.encodings, ids, &search.bc7_is_tried)?)
-            {
+            for (&id, (costs, _)) in ids.iter().zip(costs(&search.encodings, ids, &search.bc7_is_tried)?) {
                 Rung::ALL.into_iter().for_each(|rung| search.table.weigh(id, rung, costs[rung as usize]));
             }
         }
@@ -258,7 +257,7 @@ impl<'a> GridSearch<'a> {
         };
         // A fifth of the bricks has an offer worth taking.
         let mut order: Vec<(f64, u32, Loan)> = Vec::new();
-        loans(&mut self.encodings, self.tree, borrows, lends, |id, loans| {
+        loans(&self.encodings, self.tree, borrows, lends, |id, loans| {
             let as_compared = |loan: &&Loan| picks[loan.lender as usize] == compared[loan.lender as usize];
             let offers = loans.iter().filter(as_compared).map(|loan| (gain(id, loan), id, *loan));
             order.extend(offers.filter(|(gain, ..)| *gain > 0.0));
@@ -286,7 +285,7 @@ impl<'a> GridSearch<'a> {
         loop {
             let mut picks = Vec::with_capacity(all.len());
             for ids in all.chunks(BRICKS_IN_FLIGHT as usize) {
-                let costs = costs(&mut self.encodings, ids, &self.bc7_is_tried)?;
+                let costs = costs(&self.encodings, ids, &self.bc7_is_tried)?;
                 picks.extend(costs.iter().map(|(costs, _)| {
                     Rung::ALL.into_iter().find(|&rung| fits(&costs[rung as usize])).unwrap_or(Rung::F32)
                 }));
@@ -380,12 +379,12 @@ impl<'a> GridSearch<'a> {
     }
 
     pub(super) fn finish(self, picks: &[Rung]) -> io::Result<Allocation> {
-        let Self { tree, mut encodings, bc7_is_tried, table, .. } = self;
+        let Self { tree, encodings, bc7_is_tried, table, .. } = self;
         let loans = table.into_loans();
         let all: Vec<u32> = (0..picks.len() as u32).collect();
         let (mut norms, mut codings) = (Vec::with_capacity(all.len()), Vec::with_capacity(all.len()));
         for ids in all.chunks(BRICKS_IN_FLIGHT as usize) {
-            for (&id, (costs, value)) in ids.iter().zip(costs(&mut encodings, ids, &bc7_is_tried)?) {
+            for (&id, (costs, value)) in ids.iter().zip(costs(&encodings, ids, &bc7_is_tried)?) {
                 let rung = picks[id as usize];
                 norms.push(
                     loans

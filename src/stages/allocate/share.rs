@@ -73,7 +73,7 @@ const BATCHES: usize = 32;
 
 /// Visits each brick that may borrow, ascending, with the nearest of those that lend, the closest first.
 pub(super) fn loans(
-    encodings: &mut Encodings,
+    encodings: &Encodings,
     tree: &mut SequenceTree,
     borrows: impl Fn(u32) -> bool,
     lends: impl Fn(u32) -> Option<KeptCodec>,
@@ -106,10 +106,9 @@ pub(super) fn loans(
             let offers = match known {
                 Some(offers) => offers,
                 None => {
-                    let mut bricks = Vec::new();
-                    tree.read(&comparison.borrowers, &mut bricks)?;
+                    tree.fetch(&comparison.borrowers)?;
                     near.move_to(encodings, &comparison.around, &lenders)?;
-                    let offers = comparison.nearest(encodings, &bricks, &near);
+                    let offers = comparison.nearest(encodings, tree, &near)?;
                     if let Some((cache, key)) = encodings.cache().zip(key) {
                         cache.put(&key, &offers);
                     }
@@ -199,7 +198,7 @@ impl Near {
     /// Decodes the lenders of the batches in `around` that were not there for the batch before, and forgets others.
     fn move_to(
         &mut self,
-        encodings: &mut Encodings,
+        encodings: &Encodings,
         around: &Range<usize>,
         lenders: &impl Fn(&Range<u32>) -> Vec<(u32, KeptCodec)>,
     ) -> io::Result<()> {
@@ -214,7 +213,7 @@ impl Near {
     }
 }
 
-fn decoded(encodings: &mut Encodings, lenders: &[(u32, KeptCodec)]) -> io::Result<Vec<Lender>> {
+fn decoded(encodings: &Encodings, lenders: &[(u32, KeptCodec)]) -> io::Result<Vec<Lender>> {
     let mut places: [Vec<u32>; KeptCodec::ALL.len()] = Default::default();
     let mut tried = Vec::new();
     for &(id, codec) in lenders {
@@ -223,7 +222,6 @@ fn decoded(encodings: &mut Encodings, lenders: &[(u32, KeptCodec)]) -> io::Resul
     for codec in KeptCodec::ALL {
         tried.push(encodings.texels(&places[codec as usize], codec)?);
     }
-    let encodings = &*encodings;
     let lender = |&(id, codec): &(u32, KeptCodec)| {
         let place = places[codec as usize].binary_search(&id).expect("every lender is of one of the codecs");
         let (Tried { costs, bytes, axes }, codec) = (&tried[codec as usize], codec.codec());
@@ -261,15 +259,16 @@ fn coarse(values: &[f32; BRICK_VOXELS], mean: f64, energy: f64, out: &mut [f32])
 }
 
 impl Comparison {
-    /// For each borrower, whose bricks these are, the closest of the lenders.
-    fn nearest(&self, encodings: &Encodings, bricks: &[Brick], near: &Near) -> Offers {
+    /// For each borrower the closest of the lenders.
+    fn nearest(&self, encodings: &Encodings, tree: &SequenceTree, near: &Near) -> io::Result<Offers> {
         let lenders: Vec<&Lender> = near.batches.values().flatten().collect();
         let mut codebook = Array2::<f32>::zeros((lenders.len(), COARSE));
         for (lender, mut row) in lenders.iter().zip(codebook.rows_mut()) {
             row.as_slice_mut().expect("rows are contiguous").copy_from_slice(&lender.coarse);
         }
         let codebook = codebook.t();
-        let offers = |(ids, bricks): (&[u32], &[Brick])| {
+        let offers = |ids: &[u32]| -> io::Result<Offers> {
+            let bricks = tree.pool.read(ids)?;
             let mut shapes = Array2::<f32>::zeros((bricks.len(), COARSE));
             for (brick, mut row) in bricks.iter().zip(shapes.rows_mut()) {
                 let (mean, energy) = moments(&brick.values);
@@ -277,7 +276,7 @@ impl Comparison {
             }
             // The line through a shape leaves 1 - s² of a brick's energy: the most similar leaves the least.
             let similar = shapes.dot(&codebook);
-            let each = ids.iter().zip(bricks).zip(similar.rows());
+            let each = ids.iter().zip(&bricks).zip(similar.rows());
             let offers = each.map(|((&id, brick), similar)| {
                 let offer = |j: usize| {
                     let (range, cost) = borrow(encodings, brick, lenders.get(j)?)?;
@@ -288,9 +287,10 @@ impl Comparison {
                 offers.sort_by(|a, b| a.cost.norm.total_cmp(&b.cost.norm));
                 offers
             });
-            offers.collect::<Vec<_>>()
+            Ok(offers.collect())
         };
-        self.borrowers.par_chunks(ROWS).zip(bricks.par_chunks(ROWS)).flat_map_iter(offers).collect()
+        let offers: Vec<Offers> = self.borrowers.par_chunks(ROWS).map(offers).collect::<io::Result<_>>()?;
+        Ok(offers.into_iter().flatten().collect())
     }
 }
 

@@ -174,7 +174,10 @@ impl SequenceTree {
     }
 
     /// Forgets what only [`SequenceTree::add`] needs: there will be no more frames.
-    pub fn seal(&mut self) {
+    ///
+    /// # Errors
+    /// When the scratch file cannot be written.
+    pub fn seal(&mut self) -> io::Result<()> {
         self.record_of_brick = Vec::new();
         self.record_of_constant = HashMap::new();
         self.records.shrink_to_fit();
@@ -182,7 +185,7 @@ impl SequenceTree {
         self.nodes.seal();
         self.runs.seal();
         self.masks.seal();
-        self.pool.seal();
+        self.pool.seal()
     }
 
     /// Adds the next frame, and where they are at hand its voxels.
@@ -248,11 +251,11 @@ impl SequenceTree {
         self.put_voxels(frame, voxels)
     }
 
-    /// Appends some bricks of the pool to `out`. Frames whose voxels are not there are read for it, whole.
+    /// Sees to it that some bricks of the pool can be read. Frames whose voxels are not there are read for it, whole.
     ///
     /// # Errors
-    /// When a frame or the scratch file cannot be read.
-    pub fn read(&mut self, ids: &[u32], out: &mut Vec<Brick>) -> io::Result<()> {
+    /// When a frame cannot be read or the scratch file not be written.
+    pub fn fetch(&mut self, ids: &[u32]) -> io::Result<()> {
         let absent = ids.iter().filter(|&&id| !self.pool.is_there(id)).map(|&id| self.pool.home(id).frame);
         let absent: BTreeSet<u32> = absent.collect();
         let absent: Vec<usize> = absent.into_iter().map(|frame| frame as usize).collect();
@@ -264,7 +267,7 @@ impl SequenceTree {
                 self.put_fetched(frame, &voxels?)?;
             }
         }
-        self.pool.read(ids, out)
+        self.pool.flush()
     }
 
     /// All frames have one background. A frame without any voxels takes on that of the others.

@@ -246,6 +246,7 @@ impl Encodings {
                 self.keep(&ids, entry.into_made(kind))?;
             }
         }
+        self.flush()?;
         Ok(())
     }
 
@@ -273,7 +274,7 @@ impl Encodings {
         Ok(())
     }
 
-    fn entry(&mut self, tree: &SequenceTree, ids: &[u32], kind: Kind) -> io::Result<Entry> {
+    fn entry(&self, tree: &SequenceTree, ids: &[u32], kind: Kind) -> io::Result<Entry> {
         let mut entry = Entry {
             places: ids.iter().map(|&id| tree.pool.home(id).brick).collect(),
             actives: ids.iter().map(|&id| tree.pool.active_hash(id)).collect(),

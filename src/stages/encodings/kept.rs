@@ -59,12 +59,18 @@ impl<const N: usize> Kept<N> {
         self.texels.as_mut().map_or(Ok(()), |scratch| scratch.append(texels))
     }
 
+    /// Sees to it that what was added can be read.
+    pub fn flush(&mut self) -> io::Result<()> {
+        self.notes.flush()?;
+        self.texels.as_mut().map_or(Ok(()), Scratch::flush)
+    }
+
     fn places(&self, ids: &[u32]) -> Vec<u32> {
         ids.iter().map(|&id| self.places[id as usize]).collect()
     }
 
     /// The notes of bricks that are known.
-    pub fn notes(&mut self, ids: &[u32]) -> io::Result<Vec<[Note; N]>> {
+    pub fn notes(&self, ids: &[u32]) -> io::Result<Vec<[Note; N]>> {
         let mut notes = Vec::with_capacity(ids.len());
         let places = self.places(ids);
         self.notes.read(&places, |record| {
@@ -76,10 +82,11 @@ impl<const N: usize> Kept<N> {
     }
 
     /// The texels of bricks that are known, one after another.
-    pub fn texels(&mut self, ids: &[u32]) -> io::Result<Vec<u8>> {
+    pub fn texels(&self, ids: &[u32]) -> io::Result<Vec<u8>> {
         let places = self.places(ids);
         let mut texels = Vec::new();
-        if let Some(scratch) = &mut self.texels {
+        if let Some(scratch) = &self.texels {
+            texels.reserve(ids.len() * scratch.record());
             scratch.read(&places, |record| texels.extend_from_slice(record))?;
         }
         Ok(texels)

@@ -179,7 +179,7 @@ impl Encodings {
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn plain(&mut self, ids: &[u32]) -> io::Result<Vec<Plain>> {
+    pub fn plain(&self, ids: &[u32]) -> io::Result<Vec<Plain>> {
         Ok(self.plain.notes(ids)?.into_iter().map(Plain::from_notes).collect())
     }
 
@@ -187,7 +187,7 @@ impl Encodings {
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn costs(&mut self, ids: &[u32], codec: KeptCodec) -> io::Result<Vec<Cost>> {
+    pub fn costs(&self, ids: &[u32], codec: KeptCodec) -> io::Result<Vec<Cost>> {
         Ok(self.kept[codec as usize].notes(ids)?.into_iter().map(|[note]| note.cost()).collect())
     }
 
@@ -195,8 +195,8 @@ impl Encodings {
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn texels(&mut self, ids: &[u32], codec: KeptCodec) -> io::Result<Tried> {
-        let kept = &mut self.kept[codec as usize];
+    pub fn texels(&self, ids: &[u32], codec: KeptCodec) -> io::Result<Tried> {
+        let kept = &self.kept[codec as usize];
         let notes = kept.notes(ids)?;
         Ok(Tried {
             costs: notes.iter().map(|[note]| note.cost()).collect(),
@@ -240,7 +240,6 @@ impl Encodings {
         mut advance: impl FnMut(u64),
     ) -> io::Result<()> {
         self.load(tree, ids, kinds)?;
-        let mut bricks = Vec::new();
         for window in ids.chunks(BRICKS_IN_FLIGHT as usize) {
             if interrupt::is_requested() {
                 self.save(tree)?;
@@ -248,21 +247,18 @@ impl Encodings {
             }
             let missing: Vec<u32> =
                 window.iter().copied().filter(|&id| kinds.iter().any(|k| !self.is_known(id, *k))).collect();
-            bricks.clear();
-            tree.read(&missing, &mut bricks)?;
+            tree.fetch(&missing)?;
             let shared: &SequenceTree = tree;
             // A few bricks are shared out evenly.
             let threads = rayon::current_num_threads();
             let batches = missing.len().div_ceil(BATCH).next_multiple_of(threads).max(threads);
             let batch = missing.len().div_ceil(batches).max(LEAST_BATCH);
-            let made: Vec<Vec<Made>> = missing
-                .par_chunks(batch)
-                .zip(bricks.par_chunks(batch))
-                .map(|(ids, bricks)| self.make_batch(shared, ids, bricks, kinds))
-                .collect();
+            let made: Vec<io::Result<Vec<Made>>> =
+                missing.par_chunks(batch).map(|ids| self.make_batch(shared, ids, kinds)).collect();
             for (ids, made) in missing.chunks(batch).zip(made) {
-                made.into_iter().try_for_each(|made| self.keep(ids, made))?;
+                made?.into_iter().try_for_each(|made| self.keep(ids, made))?;
             }
+            self.flush()?;
             for &kind in kinds {
                 self.batches.mark(&missing, kind);
             }
@@ -274,14 +270,15 @@ impl Encodings {
         Ok(())
     }
 
-    fn make_batch(&self, tree: &SequenceTree, ids: &[u32], bricks: &[Brick], kinds: &[Kind]) -> Vec<Made> {
+    fn make_batch(&self, tree: &SequenceTree, ids: &[u32], kinds: &[Kind]) -> io::Result<Vec<Made>> {
+        let bricks = &tree.pool.read(ids)?;
         let texels: Vec<Texels> = ids.iter().zip(bricks).map(|(&id, b)| self.prepare(tree, id, b)).collect();
         let each = || ids.iter().zip(bricks).zip(&texels);
         let made = |kind: &Kind| match *kind {
             Kind::Plain => Made::Plain(each().map(|((&id, b), t)| self.make_plain(tree, id, b, t)).collect()),
             Kind::Texels(codec) => Made::Texels(codec, self.make_texels(codec.codec(), bricks, &texels)),
         };
-        kinds.iter().map(made).collect()
+        Ok(kinds.iter().map(made).collect())
     }
 
     fn make_plain(&self, tree: &SequenceTree, id: u32, brick: &Brick, texels: &Texels) -> Plain {
@@ -325,6 +322,12 @@ impl Encodings {
             }
             Made::Plain(plain) => self.keep_plain(ids, &plain),
         }
+    }
+
+    /// Sees to it that what was kept can be read.
+    fn flush(&mut self) -> io::Result<()> {
+        self.plain.flush()?;
+        self.kept.iter_mut().try_for_each(Kept::flush)
     }
 
     fn keep_plain(&mut self, ids: &[u32], plain: &[Plain]) -> io::Result<()> {
