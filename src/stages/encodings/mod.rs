@@ -9,6 +9,7 @@ use std::io;
 use std::time::{Duration, Instant};
 
 use half::f16;
+use half::slice::HalfFloatSliceExt;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -290,7 +291,12 @@ impl Encodings {
         let measure = Measure::new(brick, &texels.carried, self.terms.sign_matters);
         // Values just past the greatest half would round to it, but the codec refuses them.
         let f16 = match brick.values.iter().all(|v| v.abs() <= f16::MAX.to_f32()) {
-            true => measure.of(&brick.values.map(|v| f16::from_f32(v).to_f32()), None),
+            true => {
+                let (mut halves, mut back) = ([f16::ZERO; BRICK_VOXELS], [0.0; BRICK_VOXELS]);
+                halves.convert_from_f32_slice(&brick.values);
+                halves.convert_to_f32_slice(&mut back);
+                measure.of(&back, None)
+            }
             false => Cost::IMPOSSIBLE,
         };
         // Only where nothing but values says what is active may background stand for them.
