@@ -14,6 +14,8 @@ use crate::volume::BRICK_VOXELS;
 const BLOCK: usize = 8;
 /// Texels of a block.
 const TEXELS: usize = 16;
+/// Pairs of endpoints that are tried for a block: those of its range, and four near each of two fits.
+const TRIES: usize = 10;
 /// Steps between a block's endpoints.
 const STEPS: f32 = 7.0;
 
@@ -54,10 +56,14 @@ impl Block {
             return [0; BLOCK];
         }
         let mut best = (f32::INFINITY, [0u8; 2]);
+        let (mut tried, mut tries) = ([[0u8; 2]; TRIES], 0);
         let mut consider = |high: f32, low: f32| {
             let ends = [high.clamp(0.0, 255.0) as u8, low.clamp(0.0, 255.0) as u8];
-            // Endpoints in this order select the palette of eight values.
-            if ends[0] > ends[1] {
+            // Endpoints in this order select the palette of eight values. Fits often come to the same ends.
+            let is_new = !tried.contains(&ends);
+            tried[tries] = ends;
+            tries += 1;
+            if ends[0] > ends[1] && is_new {
                 let error = self.error(ends);
                 if error < best.0 {
                     best = (error, ends);

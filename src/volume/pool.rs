@@ -22,11 +22,14 @@ pub struct Home {
 
 /// Stores bricks so that equal ones are kept once, and gives them back by number.
 ///
-/// A brick may be known before its values are: they are put in when someone has need of them. Memory is about 25
-/// bytes a unique brick, and 40 to 80 more until [`BrickPool::seal`]; voxels, masks and digests are in scratch files.
+/// A brick may be known before its values are: they are put in when someone has need of them. Memory is 17 bytes a
+/// unique brick, and 25 to 50 more until [`BrickPool::seal`]; voxels, masks and digests are in scratch files.
 pub struct BrickPool {
     by_digest: HashMap<Key, u32>,
-    bricks: Vec<Known>,
+    homes: Vec<Home>,
+    /// [`BrickPool::active_hash`].
+    actives: Vec<u64>,
+    flags: Vec<Flags>,
     facts: Scratch,
     values: Scratch,
 }
@@ -35,17 +38,12 @@ pub struct BrickPool {
 /// added the table is the largest thing that grows with them.
 type Key = [u8; 16];
 
-/// What is asked of a brick all the time.
-struct Known {
-    home: Home,
-    /// Its place in the scratch file of values; `NOWHERE` while it is not there.
-    slot: u32,
+#[derive(Clone, Copy)]
+struct Flags {
     keeps_mask: bool,
-    /// [`BrickPool::active_hash`].
-    active: u64,
+    /// Whether its values were put in.
+    is_there: bool,
 }
-
-const NOWHERE: u32 = u32::MAX;
 
 /// What is asked of a brick together with its values.
 #[derive(Clone, Copy, Pod, Zeroable)]
@@ -63,7 +61,9 @@ impl Default for BrickPool {
     fn default() -> Self {
         Self {
             by_digest: HashMap::new(),
-            bricks: Vec::new(),
+            homes: Vec::new(),
+            actives: Vec::new(),
+            flags: Vec::new(),
             facts: Scratch::new(size_of::<Facts>()),
             values: Scratch::new(BRICK_VOXELS * 4),
         }
@@ -73,12 +73,12 @@ impl Default for BrickPool {
 impl BrickPool {
     /// How many unique bricks there are.
     pub fn len(&self) -> u32 {
-        self.bricks.len() as u32
+        self.homes.len() as u32
     }
 
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
-        self.bricks.is_empty()
+        self.homes.is_empty()
     }
 
     /// BLAKE3 of what makes a brick: its values, and its mask where that is kept. Two bricks of one digest are one:
@@ -103,23 +103,25 @@ impl BrickPool {
         keeps_mask: bool,
         home: Home,
     ) -> io::Result<(u32, bool)> {
-        let next = self.bricks.len() as u32;
+        let next = self.homes.len() as u32;
         let key = *digest.first_chunk().expect("a digest is 32 bytes");
         let id = *self.by_digest.entry(key).or_insert(next);
         if id == next {
-            self.bricks.push(Known { home, slot: NOWHERE, keeps_mask, active: hash(active) });
-            self.facts.append(bytemuck::bytes_of(&Facts { active: *active, digest: *digest }))?;
+            self.homes.push(home);
+            self.actives.push(hash(active));
+            self.flags.push(Flags { keeps_mask, is_there: false });
+            self.facts.put(id, bytemuck::bytes_of(&Facts { active: *active, digest: *digest }))?;
             return Ok((id, true));
         }
         // Without a kept mask bricks are one if their values are. The pool's counts as active what is
         // active in any of them.
-        let known = &mut self.bricks[id as usize];
-        if known.active != hash(active) {
+        let known = &mut self.actives[id as usize];
+        if *known != hash(active) {
             self.facts.flush()?;
             let mut facts: Facts = self.facts.read_as(&[id])?[0];
             facts.active = facts.active.union(active);
-            known.active = hash(&facts.active);
-            self.facts.replace(id, bytemuck::bytes_of(&facts))?;
+            *known = hash(&facts.active);
+            self.facts.put(id, bytemuck::bytes_of(&facts))?;
         }
         Ok((id, false))
     }
@@ -130,7 +132,9 @@ impl BrickPool {
     /// When the scratch file cannot be written.
     pub fn seal(&mut self) -> io::Result<()> {
         self.by_digest = HashMap::new();
-        self.bricks.shrink_to_fit();
+        self.homes.shrink_to_fit();
+        self.actives.shrink_to_fit();
+        self.flags.shrink_to_fit();
         self.facts.flush()?;
         self.values.flush()
     }
@@ -154,22 +158,22 @@ impl BrickPool {
 
     /// Whether a brick's mask is part of what it is.
     pub fn keeps_mask(&self, id: u32) -> bool {
-        self.bricks[id as usize].keeps_mask
+        self.flags[id as usize].keeps_mask
     }
 
     /// Where a brick comes from.
     pub fn home(&self, id: u32) -> Home {
-        self.bricks[id as usize].home
+        self.homes[id as usize]
     }
 
     /// A hash of which voxels of a brick are active, in any of the bricks of the source that it stands for.
     pub fn active_hash(&self, id: u32) -> u64 {
-        self.bricks[id as usize].active
+        self.actives[id as usize]
     }
 
     /// Whether a brick's values were put in.
     pub fn is_there(&self, id: u32) -> bool {
-        self.bricks[id as usize].slot != NOWHERE
+        self.flags[id as usize].is_there
     }
 
     /// Puts a brick's values in.
@@ -177,8 +181,8 @@ impl BrickPool {
     /// # Errors
     /// When the scratch file cannot be written.
     pub fn put(&mut self, id: u32, values: &[f32; BRICK_VOXELS]) -> io::Result<()> {
-        self.bricks[id as usize].slot = self.values.len();
-        self.values.append(bytemuck::bytes_of(values))
+        self.flags[id as usize].is_there = true;
+        self.values.put(id, bytemuck::bytes_of(values))
     }
 
     /// Some bricks, whose values are there.
@@ -187,12 +191,11 @@ impl BrickPool {
     /// When the scratch file cannot be read back.
     pub fn read(&self, ids: &[u32]) -> io::Result<Vec<Brick>> {
         let mut out = Vec::with_capacity(ids.len());
-        let slots: Vec<u32> = ids.iter().map(|&id| self.bricks[id as usize].slot).collect();
         let facts = self.facts.read_as::<Facts>(ids)?;
         let mut each = ids.iter().zip(facts);
-        self.values.read(&slots, |values| {
+        self.values.read(ids, |values| {
             let (&id, facts) = each.next().expect("each brick has facts and values");
-            let keeps_mask = self.bricks[id as usize].keeps_mask;
+            let keeps_mask = self.flags[id as usize].keeps_mask;
             out.push(Brick {
                 values: bytemuck::pod_read_unaligned(values),
                 active: facts.active,

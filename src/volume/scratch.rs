@@ -12,20 +12,21 @@ const BLOCK: usize = 128 << 10;
 /// Bytes between two records that are read through rather than skipped: a call to the system costs about as much.
 const GAP: u64 = 16 << 10;
 
-/// Records by the order in which they were appended. The file is made with the first of them.
+/// Records by their places, which may be filled in any order; one after another is the quickest. The file is made with
+/// the first of them.
 pub struct Scratch {
     record: usize,
     file: Option<File>,
-    /// Appended, and not in the file yet.
+    /// Put, and not in the file yet.
     buffer: Vec<u8>,
-    /// Records in the file.
-    written: u32,
+    /// The place of the first of those.
+    buffered: u32,
 }
 
 impl Scratch {
     /// None yet, of that many bytes each.
     pub fn new(record: usize) -> Self {
-        Self { record, file: None, buffer: Vec::new(), written: 0 }
+        Self { record, file: None, buffer: Vec::new(), buffered: 0 }
     }
 
     /// Bytes of each.
@@ -33,45 +34,30 @@ impl Scratch {
         self.record
     }
 
-    /// How many there are.
-    pub fn len(&self) -> u32 {
-        self.written + (self.buffer.len() / self.record) as u32
-    }
-
-    /// Whether there are none.
-    pub fn is_empty(&self) -> bool {
-        self.len() == 0
-    }
-
-    /// Appends whole records.
+    /// Puts records at a place and those after it.
     ///
     /// # Errors
     /// When the file cannot be written.
-    pub fn append(&mut self, records: &[u8]) -> io::Result<()> {
+    pub fn put(&mut self, place: u32, records: &[u8]) -> io::Result<()> {
         debug_assert!(records.len().is_multiple_of(self.record));
+        let next = self.buffered as usize + self.buffer.len() / self.record;
+        if place as usize != next {
+            self.flush()?;
+            self.buffered = place;
+        }
         self.buffer.extend_from_slice(records);
         if self.buffer.len() >= BLOCK { self.flush() } else { Ok(()) }
     }
 
-    /// Writes a record anew.
-    ///
-    /// # Errors
-    /// When the file cannot be written.
-    pub fn replace(&mut self, place: u32, record: &[u8]) -> io::Result<()> {
-        self.flush()?;
-        let at = self.at(place);
-        self.write(at, record)
-    }
-
-    /// Writes what was appended, so that it can be read.
+    /// Writes what was put, so that it can be read.
     ///
     /// # Errors
     /// When the file cannot be written.
     pub fn flush(&mut self) -> io::Result<()> {
         let mut buffer = std::mem::take(&mut self.buffer);
         if !buffer.is_empty() {
-            self.write(self.at(self.written), &buffer)?;
-            self.written += (buffer.len() / self.record) as u32;
+            self.write(self.at(self.buffered), &buffer)?;
+            self.buffered += (buffer.len() / self.record) as u32;
             buffer.clear();
             self.buffer = buffer;
         }
@@ -149,12 +135,11 @@ mod tests {
         let mut scratch = Scratch::new(8);
         for first in (0..50_000u64).step_by(100) {
             let records: Vec<u64> = (first..first + 100).collect();
-            scratch.append(bytemuck::cast_slice(&records)).unwrap();
+            scratch.put(first as u32, bytemuck::cast_slice(&records)).unwrap();
         }
-        scratch.replace(7, bytemuck::bytes_of(&70u64)).unwrap();
-        scratch.append(bytemuck::bytes_of(&50_000u64)).unwrap();
+        scratch.put(7, bytemuck::bytes_of(&70u64)).unwrap();
+        scratch.put(50_000, bytemuck::bytes_of(&50_000u64)).unwrap();
         scratch.flush().unwrap();
-        assert_eq!(scratch.len(), 50_001);
         let places: Vec<u32> = (0..50_001).step_by(3).chain([7, 50_000, 6, 6, 8]).collect();
         let expected: Vec<u64> = places.iter().map(|&p| if p == 7 { 70 } else { p.into() }).collect();
         assert_eq!(scratch.read_as::<u64>(&places).unwrap(), expected);

@@ -70,7 +70,7 @@ impl<'a> GridSearch<'a> {
         }
         let mut records = vec![0; uses.len()];
         for &record in tree.runs.items() {
-            if let Payload::Brick(id) = tree.records[record as usize].payload() {
+            if let Payload::Brick(id) = tree.record(record).payload() {
                 records[id as usize] += 1;
             }
         }

@@ -158,7 +158,7 @@ fn saved_bytes(searches: &[GridSearch], picks: &[Vec<Rung>]) -> u64 {
         let empty = picks.iter().zip(&search.table.records).filter(|(rung, _)| **rung == Rung::Empty);
         let records: u64 = empty.map(|(_, records)| u64::from(*records) * u64::from(RECORD_BITS / 8)).sum();
         let tree = &*search.tree;
-        let is_empty = |&record: &u32| match tree.records[record as usize].payload() {
+        let is_empty = |&record: &u32| match tree.record(record).payload() {
             Payload::Brick(id) => picks[id as usize] == Rung::Empty,
             Payload::Constant(_) => false,
         };

@@ -28,10 +28,10 @@ pub struct SequenceTree {
     pub frames: Vec<FrameTree>,
     /// The distinct L2 nodes.
     pub nodes: Interner<Node>,
-    /// Runs of places in [`SequenceTree::records`], one run a distinct list of children.
+    /// Runs of entries that [`SequenceTree::record`] understands, one run a distinct list of children.
     pub runs: Interner<u32>,
-    /// The distinct L3 records.
-    pub records: Vec<Record>,
+    /// The distinct L3 records of which more is to be said than which brick they are.
+    records: Vec<Record>,
     /// The distinct masks. A mask of signs follows the mask it belongs to.
     pub masks: Interner<Mask512>,
     /// The distinct bricks.
@@ -90,7 +90,7 @@ impl Node {
     }
 }
 
-/// One distinct 8³ region, in 12 bytes: there is one for each brick of a sequence.
+/// One distinct 8³ region.
 #[derive(Clone, Copy, Debug)]
 pub struct Record {
     mask: u32,
@@ -153,7 +153,19 @@ pub enum DedupError {
     },
 }
 
+/// The bit of an entry that is a brick without a mask, all of whose voxels are its texels': most are. The others are
+/// places of records.
+const PLAIN_BRICK: u32 = 1 << 31;
+
 impl SequenceTree {
+    /// The record of an entry of [`SequenceTree::runs`].
+    pub fn record(&self, entry: u32) -> Record {
+        match entry & PLAIN_BRICK {
+            0 => self.records[entry as usize],
+            _ => Record::new(None, InactiveRule::Texel, Payload::Brick(entry & !PLAIN_BRICK)),
+        }
+    }
+
     /// An empty sequence. `fetch` gives the voxels of frames that are added without; it is not needed where all have
     /// theirs.
     pub fn new(fetch: Option<Box<Fetch>>) -> Self {
@@ -316,8 +328,13 @@ impl SequenceTree {
             return Ok(self.record_of_brick[id as usize]);
         }
         let mask = self.mask(outline);
-        let record = self.records.len() as u32;
-        self.records.push(Record::new(mask, rule, Payload::Brick(id)));
+        let record = match (mask, rule) {
+            (None, InactiveRule::Texel) => id | PLAIN_BRICK,
+            _ => {
+                self.records.push(Record::new(mask, rule, Payload::Brick(id)));
+                self.records.len() as u32 - 1
+            }
+        };
         self.record_of_brick.push(record);
         self.brick_ranges.push(range);
         Ok(record)
@@ -332,9 +349,13 @@ impl SequenceTree {
 
     /// The inactive rule of each brick of the pool.
     pub fn brick_rules(&self) -> Vec<InactiveRule> {
-        // Records of bricks are made in the order of the pool.
-        let of_brick = self.records.iter().filter(|r| matches!(r.payload(), Payload::Brick(_)));
-        of_brick.map(|r| r.rule).collect()
+        let mut rules = vec![InactiveRule::Texel; self.pool.len() as usize];
+        for record in &self.records {
+            if let Payload::Brick(id) = record.payload() {
+                rules[id as usize] = record.rule;
+            }
+        }
+        rules
     }
 
     /// The bricks of the pool that a frame uses, shared ones each time.
@@ -343,7 +364,7 @@ impl SequenceTree {
             CellRef::Node(node) => Some(&self.nodes.items()[*node as usize]),
             CellRef::Constant(_) => None,
         });
-        let records = nodes.flat_map(|node| node.entries(&self.runs)).map(|&r| &self.records[r as usize]);
+        let records = nodes.flat_map(|node| node.entries(&self.runs)).map(|&entry| self.record(entry));
         records.filter_map(|record| match record.payload() {
             Payload::Brick(id) => Some(id),
             Payload::Constant(_) => None,
@@ -358,10 +379,10 @@ impl SequenceTree {
         for node in nodes.items() {
             let mut left = Node { children: [0; 64], run: 0 };
             run.clear();
-            for (place, &record) in bits(&node.children).zip(node.entries(&runs)) {
-                if !matches!(self.records[record as usize].payload(), Payload::Brick(id) if is_empty(id)) {
+            for (place, &entry) in bits(&node.children).zip(node.entries(&runs)) {
+                if !matches!(self.record(entry).payload(), Payload::Brick(id) if is_empty(id)) {
                     left.children[place >> 6] |= 1 << (place & 63);
-                    run.push(record);
+                    run.push(entry);
                 }
             }
             moved.push((!run.is_empty()).then(|| {
