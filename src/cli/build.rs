@@ -1,5 +1,7 @@
 //! `volpack build`.
 
+use std::path::PathBuf;
+
 use clap::Args;
 use serde_json::{Value as Json, json};
 
@@ -9,6 +11,7 @@ use super::style::{self, GOOD, TITLE};
 use super::{Common, outln, print_json};
 use crate::error::{Error, Result};
 use crate::pipeline::{Job, Made, Outcome, VerifyLevel, build};
+use crate::trace;
 
 #[derive(Args)]
 pub struct BuildArgs {
@@ -17,11 +20,17 @@ pub struct BuildArgs {
     /// Print what was built as JSON
     #[arg(long)]
     json: bool,
+    /// Write what each thread did and when, for chrome://tracing or ui.perfetto.dev
+    #[arg(long, value_name = "FILE.json")]
+    trace: Option<PathBuf>,
 }
 
 pub fn run(args: &BuildArgs, common: Common) -> Result<()> {
     let mut assets = Vec::new();
     let mut failure = None;
+    if args.trace.is_some() {
+        trace::record();
+    }
     let cache = args.jobs.open_cache();
     for (name, job) in args.jobs.jobs(cache.as_ref(), VerifyLevel::All)? {
         if matches!(failure, Some(Error::Interrupted)) {
@@ -39,6 +48,7 @@ pub fn run(args: &BuildArgs, common: Common) -> Result<()> {
     if let Some(cache) = cache.filter(|_| !matches!(failure, Some(Error::Interrupted))) {
         super::cache::finish(&cache, common.quiet || args.json);
     }
+    args.trace.as_deref().map_or(Ok(()), trace::write)?;
     if args.json {
         print_json(&json!({ "assets": assets }));
     }

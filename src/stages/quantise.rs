@@ -9,6 +9,7 @@ use super::dedup::SequenceTree;
 use super::encodings::{KeptCodec, Kind, Tried};
 use super::relayout::{self, PlannedAtlas, Texture, TextureOf};
 use crate::codec::{Codec, OutOfRange, Texels, decode, encode};
+use crate::trace;
 use crate::volume::{BRICKS_IN_FLIGHT, Brick};
 
 /// One grid's bricks and how they are coded.
@@ -99,6 +100,7 @@ pub fn quantise<T: Send>(
         let encoded: Vec<_> = runs
             .into_par_iter()
             .map(|runs| {
+                let _span = trace::span("quantise");
                 let encoded = encode_slab(atlas.codec, grids, runs)?;
                 let bytes: Vec<u8> = encoded.iter().flat_map(|e| &e.bytes).copied().collect();
                 Ok((finish(relayout::assemble(atlas, &bytes))?, encoded))

@@ -18,6 +18,7 @@ use super::share::{Loan, loans};
 use super::{Allocation, Coding, Shape};
 use crate::stages::dedup::{Payload, SequenceTree};
 use crate::stages::encodings::{Cost, Encodings, KeptCodec, Kind, Tried};
+use crate::trace;
 use crate::volume::{BRICKS_IN_FLIGHT, ValueRange};
 
 /// A step is 1.1 % of λ, under 0.05 dB of PSNR.
@@ -182,7 +183,9 @@ impl<'a> GridSearch<'a> {
     ) -> io::Result<(u32, Vec<Rung>)> {
         let allowed = Self::allowance(self.active_voxels, psnr);
         loop {
+            let span = trace::span("search");
             let step = first_step(|step| self.squares(&self.picks(step)) <= allowed);
+            drop(span);
             let fine = self.picks(step);
             if self.try_unknown((0..).zip(fine.iter().copied()), advance)? {
                 continue;

@@ -22,6 +22,7 @@ use crate::cache::{Key, Stage};
 use crate::codec::{BrickRange, SequenceRange, decode};
 use crate::stages::dedup::SequenceTree;
 use crate::stages::encodings::{Batch, Cost, Encodings, KeptCodec, Tried};
+use crate::trace;
 use crate::volume::{BRICK_VOXELS, Brick, Mask512};
 
 const STAGE: Stage = Stage { name: "share", version: 1, travels: true };
@@ -268,6 +269,7 @@ impl Comparison {
         }
         let codebook = codebook.t();
         let offers = |ids: &[u32]| -> io::Result<Offers> {
+            let _span = trace::span("share");
             let bricks = tree.pool.read(ids)?;
             let mut shapes = Array2::<f32>::zeros((bricks.len(), COARSE));
             for (brick, mut row) in bricks.iter().zip(shapes.rows_mut()) {

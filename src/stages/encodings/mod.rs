@@ -17,6 +17,7 @@ use super::dedup::{SequenceTree, carried};
 use crate::codec::{BATCH, BrickRange, Codec, SequenceRange, Texels, decode, encode, spread};
 use crate::interrupt;
 use crate::settings::RangeMode;
+use crate::trace;
 use crate::volume::{BRICK_VOXELS, BRICKS_IN_FLIGHT, Brick, InactiveRule, Mask512};
 use cached::Batches;
 pub use cached::{Batch, GridCache};
@@ -272,6 +273,7 @@ impl Encodings {
     }
 
     fn make_batch(&self, tree: &SequenceTree, ids: &[u32], kinds: &[Kind]) -> io::Result<Vec<Made>> {
+        let _span = trace::span("encode");
         let bricks = &tree.pool.read(ids)?;
         let texels: Vec<Texels> = ids.iter().zip(bricks).map(|(&id, b)| self.prepare(tree, id, b)).collect();
         let each = || ids.iter().zip(bricks).zip(&texels);
