@@ -47,6 +47,7 @@ pub mod report;
 pub mod settings;
 pub mod stages;
 pub mod sweep;
+pub mod trace;
 mod units;
 pub mod vdb;
 pub mod verify;

@@ -1,5 +1,7 @@
 //! `volpack build`.
 
+use std::path::PathBuf;
+
 use clap::Args;
 use serde_json::{Value as Json, json};
 
@@ -13,7 +15,7 @@ use crate::pipeline::{Job, Made, Outcome, VerifyLevel, build};
 use crate::report::model::{Figures, Total};
 use crate::report::{Breach, Checked, of_total};
 use crate::settings::Budget;
-use crate::units;
+use crate::{trace, units};
 
 #[derive(Args)]
 pub struct BuildArgs {
@@ -22,11 +24,17 @@ pub struct BuildArgs {
     /// Print what was built as JSON
     #[arg(long)]
     json: bool,
+    /// Write what each thread did and when, for chrome://tracing or ui.perfetto.dev
+    #[arg(long, value_name = "FILE.json")]
+    trace: Option<PathBuf>,
 }
 
 pub fn run(args: &BuildArgs, common: Common) -> Result<()> {
     let mut assets = Vec::new();
     let mut failure = None;
+    if args.trace.is_some() {
+        trace::record();
+    }
     let cache = args.jobs.open_cache();
     let (all, limits) = args.jobs.budgets()?;
     let mut built: Vec<(String, Figures)> = Vec::new();
@@ -55,6 +63,7 @@ pub fn run(args: &BuildArgs, common: Common) -> Result<()> {
     if let Some(cache) = cache.filter(|_| !matches!(failure, Some(Error::Interrupted))) {
         super::cache::finish(&cache, common.quiet || args.json)?;
     }
+    args.trace.as_deref().map_or(Ok(()), trace::write)?;
     let packs: Vec<(&str, &Figures)> = built.iter().map(|(name, figures)| (&**name, figures)).collect();
     breaches.extend(of_total(&Total::new(&packs, &all), &packs));
     if args.json {

@@ -14,14 +14,15 @@ use crate::volume::BRICK_VOXELS;
 const BLOCK: usize = 8;
 /// Texels of a block.
 const TEXELS: usize = 16;
+/// Pairs of endpoints that are tried for a block: those of its range, and four near each of two fits.
+const TRIES: usize = 10;
 /// Steps between a block's endpoints.
 const STEPS: f32 = 7.0;
 
 pub(super) fn encode(sequence: &SequenceRange, batch: &[Texels]) -> Vec<u8> {
     let mut out = Vec::with_capacity(batch.len() * BRICK_VOXELS / TEXELS * BLOCK);
     for brick in batch {
-        let codes: [f32; BRICK_VOXELS] =
-            std::array::from_fn(|i| sequence.normalise(brick.range, brick.values[i]) * 255.0);
+        let codes = sequence.normalise(brick.range, &brick.values).map(|fraction| fraction * 255.0);
         let weights: [f32; BRICK_VOXELS] =
             std::array::from_fn(|i| if brick.carried.get(i) { 1.0 } else { 0.0 });
         let (codes, weights) = (texel_order(&codes), texel_order(&weights));
@@ -55,10 +56,14 @@ impl Block {
             return [0; BLOCK];
         }
         let mut best = (f32::INFINITY, [0u8; 2]);
+        let (mut tried, mut tries) = ([[0u8; 2]; TRIES], 0);
         let mut consider = |high: f32, low: f32| {
             let ends = [high.clamp(0.0, 255.0) as u8, low.clamp(0.0, 255.0) as u8];
-            // Endpoints in this order select the palette of eight values.
-            if ends[0] > ends[1] {
+            // Endpoints in this order select the palette of eight values. Fits often come to the same ends.
+            let is_new = !tried.contains(&ends);
+            tried[tries] = ends;
+            tries += 1;
+            if ends[0] > ends[1] && is_new {
                 let error = self.error(ends);
                 if error < best.0 {
                     best = (error, ends);

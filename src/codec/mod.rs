@@ -10,7 +10,6 @@ mod blocks;
 mod plain;
 mod range;
 
-use half::f16;
 use rayon::prelude::*;
 
 pub use range::{BrickRange, SequenceRange};
@@ -182,7 +181,7 @@ pub fn decode(
         Codec::Bc7 => bc7::decode(bytes, axis, &mut out),
         Codec::Bc4 => bc4::decode(bytes, &mut out),
         Codec::Unorm8 => plain::decode(bytes, |[byte]| f32::from(byte) / 255.0, &mut out),
-        Codec::F16 => plain::decode(bytes, |b| f16::from_le_bytes(b).to_f32(), &mut out),
+        Codec::F16 => plain::decode_f16(bytes, &mut out),
         Codec::F32 => plain::decode(bytes, f32::from_le_bytes, &mut out),
     }
     if codec.is_normalised() {

@@ -1,6 +1,7 @@
 //! Codecs of one texel a voxel: unorm8, f16, f32. Texel (x, y) of slice z is voxel (x, y, z).
 
 use half::f16;
+use half::slice::HalfFloatSliceExt;
 use ndarray::{ArrayView3, ArrayViewMut3};
 
 use super::{OutOfRange, SequenceRange, Texels};
@@ -18,28 +19,47 @@ pub(super) fn texel_order_mut(values: &mut [f32; BRICK_VOXELS]) -> ArrayViewMut3
     voxels.permuted_axes([2, 1, 0])
 }
 
-/// A value as an 8-bit fraction of its brick's range.
-pub(super) fn unorm8(sequence: &SequenceRange, brick: &Texels, value: f32) -> u8 {
-    (sequence.normalise(brick.range, value) * 255.0).round() as u8
+/// Fractions, 0 to 1, in 8 bits.
+pub(super) fn unorm8(fractions: &[f32; BRICK_VOXELS]) -> [u8; BRICK_VOXELS] {
+    fractions.map(|fraction| {
+        // f32::round, without a call for each.
+        let (scaled, whole) = (fraction * 255.0, (fraction * 255.0) as i32);
+        (whole + i32::from(scaled - whole as f32 >= 0.5)) as u8
+    })
+}
+
+/// What a brick has at each texel, z slowest, x fastest.
+fn in_texel_order<T: Copy + Default>(voxels: &[T; BRICK_VOXELS]) -> [T; BRICK_VOXELS] {
+    let mut texels = [T::default(); BRICK_VOXELS];
+    for (z, slice) in texels.chunks_exact_mut(64).enumerate() {
+        for (y, row) in slice.chunks_exact_mut(8).enumerate() {
+            for (x, texel) in row.iter_mut().enumerate() {
+                *texel = voxels[x << 6 | y << 3 | z];
+            }
+        }
+    }
+    texels
 }
 
 pub(super) fn encode_unorm8(sequence: &SequenceRange, batch: &[Texels]) -> Vec<u8> {
-    let texels = |brick| move |&v: &f32| unorm8(sequence, brick, v);
-    batch
-        .iter()
-        .flat_map(|brick| texel_order(&brick.values).iter().map(texels(brick)).collect::<Vec<_>>())
-        .collect()
+    let mut out = Vec::with_capacity(batch.len() * BRICK_VOXELS);
+    for brick in batch {
+        let fractions = sequence.normalise(brick.range, &brick.values);
+        out.extend_from_slice(&in_texel_order(&unorm8(&fractions)));
+    }
+    out
 }
 
 pub(super) fn encode_f16(batch: &[Texels]) -> Result<Vec<u8>, OutOfRange> {
     let mut out = Vec::with_capacity(batch.len() * BRICK_VOXELS * 2);
     for brick in batch {
-        for &value in texel_order(&brick.values) {
-            if value.abs() > f16::MAX.to_f32() {
-                return Err(OutOfRange { value });
-            }
-            out.extend(f16::from_f32(value).to_le_bytes());
+        let texels = in_texel_order(&brick.values);
+        if let Some(&value) = texels.iter().find(|v| v.abs() > f16::MAX.to_f32()) {
+            return Err(OutOfRange { value });
         }
+        let mut halves = [f16::ZERO; BRICK_VOXELS];
+        halves.convert_from_f32_slice(&texels);
+        out.extend_from_slice(bytemuck::cast_slice(&halves));
     }
     Ok(out)
 }
@@ -47,7 +67,7 @@ pub(super) fn encode_f16(batch: &[Texels]) -> Result<Vec<u8>, OutOfRange> {
 pub(super) fn encode_f32(batch: &[Texels]) -> Vec<u8> {
     let mut out = Vec::with_capacity(batch.len() * BRICK_VOXELS * 4);
     for brick in batch {
-        texel_order(&brick.values).iter().for_each(|v| out.extend(v.to_le_bytes()));
+        out.extend_from_slice(bytemuck::cast_slice(&in_texel_order(&brick.values)));
     }
     out
 }
@@ -57,7 +77,19 @@ pub(super) fn decode<const N: usize>(
     texel: impl Fn([u8; N]) -> f32,
     out: &mut [f32; BRICK_VOXELS],
 ) {
-    for (value, bytes) in texel_order_mut(out).iter_mut().zip(bytes.as_chunks::<N>().0) {
-        *value = texel(*bytes);
+    let texels = bytes.as_chunks::<N>().0;
+    for (i, value) in out.iter_mut().enumerate() {
+        let (x, y, z) = (i >> 6, i >> 3 & 7, i & 7);
+        *value = texel(texels[z << 6 | y << 3 | x]);
+    }
+}
+
+pub(super) fn decode_f16(bytes: &[u8], out: &mut [f32; BRICK_VOXELS]) {
+    let mut texels = [0.0; BRICK_VOXELS];
+    let halves: Vec<f16> = bytemuck::allocation::pod_collect_to_vec(bytes);
+    halves.convert_to_f32_slice(&mut texels);
+    for (i, value) in out.iter_mut().enumerate() {
+        let (x, y, z) = (i >> 6, i >> 3 & 7, i & 7);
+        *value = texels[z << 6 | y << 3 | x];
     }
 }

@@ -90,15 +90,14 @@ impl SequenceRange {
         brick
     }
 
-    /// The fraction that `value` is of the brick's range, 0 to 1.
-    #[inline]
-    pub(super) fn normalise(&self, brick: BrickRange, value: f32) -> f32 {
-        let extent = brick.extent.to_f64();
+    /// The fractions that some values are of the brick's range, 0 to 1.
+    pub(super) fn normalise<const N: usize>(&self, brick: BrickRange, values: &[f32; N]) -> [f32; N] {
+        let (lo, span) = (f64::from(self.lo), f64::from(self.span));
+        let (min, extent) = (f64::from(brick.min) / 65535.0, brick.extent.to_f64());
         if extent == 0.0 {
-            return 0.0;
+            return [0.0; N];
         }
-        let of_span = (f64::from(value) - f64::from(self.lo)) / f64::from(self.span);
-        ((of_span - f64::from(brick.min) / 65535.0) / extent).clamp(0.0, 1.0) as f32
+        values.map(|v| (((f64::from(v) - lo) / span - min) / extent).clamp(0.0, 1.0) as f32)
     }
 }
 

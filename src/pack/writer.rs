@@ -130,6 +130,7 @@ impl PackWriter {
     /// # Errors
     /// When the file cannot be written.
     pub fn chunk(&mut self, chunk: &StoredChunk) -> io::Result<()> {
+        let _span = crate::trace::span("write");
         self.out.write_all(&chunk.bytes)?;
         let stored = chunk.bytes.len() as u32;
         self.chunks.push(Chunk {
@@ -192,6 +193,7 @@ impl PackWriter {
         self.out.write_all(bytemuck::cast_slice(&self.sections))?;
         self.out.write_all(bytemuck::cast_slice(&self.chunks))?;
         let file = self.out.into_inner().map_err(io::IntoInnerError::into_error)?;
+        let _span = crate::trace::span("sync");
         file.as_file().sync_all()?;
         make_readable(file.as_file())?;
         Ok(FinishedPack { file, path: self.path })

@@ -14,6 +14,7 @@ use crate::stages::flatten::{Flattened, flatten};
 use crate::stages::metadata::{FrameSource, SequenceInfo};
 use crate::stages::select::{SelectedGrid, Selection, find};
 use crate::stages::serialise::{FrameInput, GridInput};
+use crate::trace;
 use crate::vdb::{GridClass, VdbFile};
 use crate::volume::{Brick, FlatFrame};
 
@@ -38,8 +39,7 @@ pub(super) fn read(
     let mut grids: Vec<GridInput> = Vec::new();
     for grid in &selection.grids {
         let fetch = cache.is_some().then(|| fetch(sequence, grid, settings));
-        let tree = SequenceTree::new(fetch).map_err(scratch)?;
-        grids.push(grid_input(sequence, grid, tree, settings));
+        grids.push(grid_input(sequence, grid, SequenceTree::new(fetch), settings));
     }
     for window in sequence.frames.chunks(rayon::current_num_threads()) {
         crate::interrupt::check()?;
@@ -48,6 +48,7 @@ pub(super) fn read(
         for (source, frame) in window.iter().zip(frames) {
             for (grid, frame) in grids.iter_mut().zip(frame?) {
                 let Some((outline, voxels)) = frame else { continue };
+                let _span = trace::span("dedup");
                 grid.tree.add(outline, voxels).map_err(|e| match e {
                     DedupError::Scratch { source } => scratch(source),
                     DedupError::Background { .. } => Error::Input(format!(
@@ -60,6 +61,7 @@ pub(super) fn read(
             progress.advance(1);
         }
     }
+    grids.iter_mut().try_for_each(|grid| grid.tree.seal()).map_err(scratch)?;
     Ok(grids)
 }
 
@@ -83,11 +85,13 @@ fn read_frame(
             Some(file) => file,
             None => file.insert(VdbFile::open(&frame.path).map_err(Error::vdb(&frame.path))?),
         };
+        let span = trace::span("flatten");
         let mut flat = flatten_grid(file, frame, grid, settings)?;
         if let Some(alter) = alter {
             alter(&mut flat.frame);
         }
         let (outline, voxels) = Outline::split(flat, mask_policy(settings, grid.class));
+        drop(span);
         read.push(key);
         Ok(Some((outline, Some(voxels))))
     };

@@ -6,9 +6,10 @@ use rayon::prelude::*;
 
 use super::allocate::{Allocation, Coding};
 use super::dedup::SequenceTree;
-use super::encodings::{KeptCodec, Kind};
+use super::encodings::{KeptCodec, Kind, Tried};
 use super::relayout::{self, PlannedAtlas, Texture, TextureOf};
 use crate::codec::{Codec, OutOfRange, Texels, decode, encode};
+use crate::trace;
 use crate::volume::{BRICKS_IN_FLIGHT, Brick};
 
 /// One grid's bricks and how they are coded.
@@ -59,7 +60,7 @@ enum Run {
     /// One slot's texels, which are there already.
     Encoded(Encoded),
     /// Bricks of one grid, by their numbers in its pool.
-    Bricks(Vec<u32>, Vec<Brick>),
+    Bricks(Vec<u32>),
 }
 
 /// One brick's texels, encoded.
@@ -99,6 +100,7 @@ pub fn quantise<T: Send>(
         let encoded: Vec<_> = runs
             .into_par_iter()
             .map(|runs| {
+                let _span = trace::span("quantise");
                 let encoded = encode_slab(atlas.codec, grids, runs)?;
                 let bytes: Vec<u8> = encoded.iter().flat_map(|e| &e.bytes).copied().collect();
                 Ok((finish(relayout::assemble(atlas, &bytes))?, encoded))
@@ -154,16 +156,15 @@ fn read_runs(grids: &mut [GridBricks], codec: Codec, textures: &[Texture]) -> io
         let ids: Vec<u32> = run.iter().map(id).collect();
         match KeptCodec::of(codec) {
             Some(kept) => {
-                let texels = allocation.encodings.texels(&ids, kept)?;
-                runs.extend(ids.iter().zip(texels).map(|(&id, (bytes, axis))| {
-                    let norm = allocation.encodings.cost(id, kept).map(|cost| cost.norm);
-                    (index, Run::Encoded(Encoded { bytes, axis, norm }))
+                let Tried { costs, bytes, axes } = allocation.encodings.texels(&ids, kept)?;
+                let each = bytes.chunks_exact(codec.layout().brick_bytes()).zip(costs).zip(axes);
+                runs.extend(each.map(|((bytes, cost), axis)| {
+                    (index, Run::Encoded(Encoded { bytes: bytes.to_vec(), axis, norm: Some(cost.norm) }))
                 }));
             }
             None => {
-                let mut bricks = Vec::with_capacity(ids.len());
-                tree.read(&ids, &mut bricks)?;
-                runs.push((index, Run::Bricks(ids, bricks)));
+                tree.fetch(&ids)?;
+                runs.push((index, Run::Bricks(ids)));
             }
         }
     }
@@ -179,10 +180,13 @@ fn encode_slab(
     for (grid, run) in runs {
         match run {
             Run::Encoded(encoded) => out.push(encoded),
-            Run::Bricks(ids, bricks) => out.extend(
-                encode_bricks(codec, &grids[grid], &ids, &bricks)
-                    .map_err(|source| QuantiseError::OutOfRange { grid, source })?,
-            ),
+            Run::Bricks(ids) => {
+                let bricks = grids[grid].tree.pool.read(&ids)?;
+                out.extend(
+                    encode_bricks(codec, &grids[grid], &ids, &bricks)
+                        .map_err(|source| QuantiseError::OutOfRange { grid, source })?,
+                );
+            }
         }
     }
     Ok(out)

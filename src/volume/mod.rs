@@ -7,9 +7,11 @@ mod coord;
 mod frame;
 mod mask;
 mod pool;
+mod scratch;
 
 pub use brick::{BRICK_VOXELS, Brick, InactiveRule};
 pub use coord::{BRICK_DIM, CELL_DIM, Coord, CoordBox, ROOT_DIM};
 pub use frame::{Cell, CellContent, Child, Constant, FlatFrame, FrameStats, ValueRange};
 pub use mask::{Mask512, bits};
 pub use pool::{BRICKS_IN_FLIGHT, BrickPool, Home, Interner};
+pub use scratch::Scratch;

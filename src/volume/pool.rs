@@ -1,17 +1,14 @@
-//! The unique bricks of a sequence: small records in memory, values in a scratch file.
+//! The unique bricks of a sequence: little of each in memory, the rest in scratch files.
 
 use std::collections::HashMap;
-use std::fs::File;
-use std::io::{self, BufWriter, Read, Seek, SeekFrom, Write};
+use std::io;
 
-use xxhash_rust::xxh3::xxh3_128;
+use bytemuck::{Pod, Zeroable};
+use xxhash_rust::xxh3::{xxh3_64, xxh3_128};
 
-use super::{BRICK_VOXELS, Brick, Mask512};
+use super::{BRICK_VOXELS, Brick, Mask512, Scratch};
 
-/// Bytes of one brick in the scratch file.
-const SCRATCH_BRICK_BYTES: usize = BRICK_VOXELS * 4;
-
-/// Bricks that are read back at a time: 8 MB of voxels, enough batches of an encoder for every core.
+/// Bricks that are worked on before what was made of them is put away: enough batches of an encoder for every core.
 pub const BRICKS_IN_FLIGHT: u32 = 4096;
 
 /// Where a brick comes from.
@@ -25,52 +22,63 @@ pub struct Home {
 
 /// Stores bricks so that equal ones are kept once, and gives them back by number.
 ///
-/// A brick may be known before its values are: they are put in when someone has need of them. Memory is about 160
-/// bytes a unique brick; the 2 KB of voxels go to an unnamed temporary file.
+/// A brick may be known before its values are: they are put in when someone has need of them. Memory is 17 bytes a
+/// unique brick, and 25 to 50 more until [`BrickPool::seal`]; voxels, masks and digests are in scratch files.
 pub struct BrickPool {
-    by_hash: HashMap<[u8; 32], u32>,
-    bricks: Vec<Known>,
-    writer: BufWriter<File>,
-    reader: File,
-    /// Bricks in the scratch file.
-    written: u32,
-    /// Those of them that have reached it and can be read back.
-    flushed: u32,
+    by_digest: HashMap<Key, u32>,
+    homes: Vec<Home>,
+    /// [`BrickPool::active_hash`].
+    actives: Vec<u64>,
+    flags: Vec<Flags>,
+    facts: Scratch,
+    values: Scratch,
 }
 
-struct Known {
-    active: Mask512,
+/// Half of a digest tells bricks apart as well: nobody has ever found two texts of one either, and while frames are
+/// added the table is the largest thing that grows with them.
+type Key = [u8; 16];
+
+#[derive(Clone, Copy)]
+struct Flags {
     keeps_mask: bool,
-    home: Home,
-    /// Its place in the scratch file.
-    slot: Option<u32>,
+    /// Whether its values were put in.
+    is_there: bool,
+}
+
+/// What is asked of a brick together with its values.
+#[derive(Clone, Copy, Pod, Zeroable)]
+#[repr(C)]
+struct Facts {
+    active: Mask512,
+    digest: [u8; 32],
+}
+
+fn hash(active: &Mask512) -> u64 {
+    xxh3_64(bytemuck::bytes_of(active))
+}
+
+impl Default for BrickPool {
+    fn default() -> Self {
+        Self {
+            by_digest: HashMap::new(),
+            homes: Vec::new(),
+            actives: Vec::new(),
+            flags: Vec::new(),
+            facts: Scratch::new(size_of::<Facts>()),
+            values: Scratch::new(BRICK_VOXELS * 4),
+        }
+    }
 }
 
 impl BrickPool {
-    /// An empty pool with its scratch file in the platform's temporary directory.
-    ///
-    /// # Errors
-    /// When no temporary file can be made.
-    pub fn new() -> io::Result<Self> {
-        let file = tempfile::tempfile()?;
-        Ok(Self {
-            by_hash: HashMap::new(),
-            bricks: Vec::new(),
-            reader: file.try_clone()?,
-            writer: BufWriter::with_capacity(1 << 20, file),
-            written: 0,
-            flushed: 0,
-        })
-    }
-
     /// How many unique bricks there are.
     pub fn len(&self) -> u32 {
-        self.bricks.len() as u32
+        self.homes.len() as u32
     }
 
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
-        self.bricks.is_empty()
+        self.homes.is_empty()
     }
 
     /// BLAKE3 of what makes a brick: its values, and its mask where that is kept. Two bricks of one digest are one:
@@ -85,45 +93,87 @@ impl BrickPool {
     }
 
     /// The number of the brick with this digest, and whether it is new. Its values are still to be put in.
+    ///
+    /// # Errors
+    /// When the scratch file fails.
     pub fn insert(
         &mut self,
         digest: &[u8; 32],
         active: &Mask512,
         keeps_mask: bool,
         home: Home,
-    ) -> (u32, bool) {
-        let next = self.bricks.len() as u32;
-        let id = *self.by_hash.entry(*digest).or_insert(next);
+    ) -> io::Result<(u32, bool)> {
+        let next = self.homes.len() as u32;
+        let key = *digest.first_chunk().expect("a digest is 32 bytes");
+        let id = *self.by_digest.entry(key).or_insert(next);
         if id == next {
-            self.bricks.push(Known { active: *active, keeps_mask, home, slot: None });
-            return (id, true);
+            self.homes.push(home);
+            self.actives.push(hash(active));
+            self.flags.push(Flags { keeps_mask, is_there: false });
+            self.facts.put(id, bytemuck::bytes_of(&Facts { active: *active, digest: *digest }))?;
+            return Ok((id, true));
         }
         // Without a kept mask bricks are one if their values are. The pool's counts as active what is
         // active in any of them.
-        let known = &mut self.bricks[id as usize];
-        known.active = known.active.union(active);
-        (id, false)
+        let known = &mut self.actives[id as usize];
+        if *known != hash(active) {
+            self.facts.flush()?;
+            let mut facts: Facts = self.facts.read_as(&[id])?[0];
+            facts.active = facts.active.union(active);
+            *known = hash(&facts.active);
+            self.facts.put(id, bytemuck::bytes_of(&facts))?;
+        }
+        Ok((id, false))
     }
 
-    /// Whether a brick of the source is the one that this number stands for.
-    pub fn is_digest_of(&self, id: u32, brick: &Brick) -> bool {
-        let brick = Brick { keeps_mask: self.bricks[id as usize].keeps_mask, ..brick.clone() };
-        self.by_hash.get(&Self::digest(&brick)) == Some(&id)
+    /// Forgets what only [`BrickPool::insert`] needs: there will be no more bricks.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be written.
+    pub fn seal(&mut self) -> io::Result<()> {
+        self.by_digest = HashMap::new();
+        self.homes.shrink_to_fit();
+        self.actives.shrink_to_fit();
+        self.flags.shrink_to_fit();
+        self.facts.flush()?;
+        self.values.flush()
+    }
+
+    /// Sees to it that the values that were put in can be read.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be written.
+    pub fn flush(&mut self) -> io::Result<()> {
+        self.values.flush()
+    }
+
+    /// The digests that some bricks were inserted with.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be read back.
+    pub fn digests(&self, ids: &[u32]) -> io::Result<Vec<[u8; 32]>> {
+        let facts = self.facts.read_as::<Facts>(ids)?;
+        Ok(facts.into_iter().map(|facts| facts.digest).collect())
+    }
+
+    /// Whether a brick's mask is part of what it is.
+    pub fn keeps_mask(&self, id: u32) -> bool {
+        self.flags[id as usize].keeps_mask
     }
 
     /// Where a brick comes from.
     pub fn home(&self, id: u32) -> Home {
-        self.bricks[id as usize].home
+        self.homes[id as usize]
     }
 
-    /// Which voxels of a brick are active, in any of the bricks of the source that it stands for.
-    pub fn active(&self, id: u32) -> &Mask512 {
-        &self.bricks[id as usize].active
+    /// A hash of which voxels of a brick are active, in any of the bricks of the source that it stands for.
+    pub fn active_hash(&self, id: u32) -> u64 {
+        self.actives[id as usize]
     }
 
     /// Whether a brick's values were put in.
     pub fn is_there(&self, id: u32) -> bool {
-        self.bricks[id as usize].slot.is_some()
+        self.flags[id as usize].is_there
     }
 
     /// Puts a brick's values in.
@@ -131,36 +181,31 @@ impl BrickPool {
     /// # Errors
     /// When the scratch file cannot be written.
     pub fn put(&mut self, id: u32, values: &[f32; BRICK_VOXELS]) -> io::Result<()> {
-        self.writer.write_all(bytemuck::bytes_of(values))?;
-        self.bricks[id as usize].slot = Some(self.written);
-        self.written += 1;
-        Ok(())
+        self.flags[id as usize].is_there = true;
+        self.values.put(id, bytemuck::bytes_of(values))
     }
 
-    /// Appends some bricks, whose values are there, to `out`.
+    /// Some bricks, whose values are there.
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn read(&mut self, ids: &[u32], out: &mut Vec<Brick>) -> io::Result<()> {
-        if self.flushed < self.written {
-            self.writer.flush()?;
-            self.flushed = self.written;
-        }
-        let slot = |id: &u32| self.bricks[*id as usize].slot.expect("the brick's values were put in");
-        let mut bytes = Vec::new();
-        for run in ids.chunk_by(|a, b| slot(a) + 1 == slot(b)) {
-            bytes.resize(run.len() * SCRATCH_BRICK_BYTES, 0);
-            // Reader and writer share one file position.
-            self.reader.seek(SeekFrom::Start(u64::from(slot(&run[0])) * SCRATCH_BRICK_BYTES as u64))?;
-            self.reader.read_exact(&mut bytes)?;
-            out.extend(bytes.chunks_exact(SCRATCH_BRICK_BYTES).zip(run).map(|(values, &id)| {
-                let Known { active, keeps_mask, .. } = self.bricks[id as usize];
-                Brick { values: bytemuck::pod_read_unaligned(values), active, keeps_mask }
-            }));
-        }
-        self.reader.seek(SeekFrom::End(0)).map(drop)
+    pub fn read(&self, ids: &[u32]) -> io::Result<Vec<Brick>> {
+        let mut out = Vec::with_capacity(ids.len());
+        let facts = self.facts.read_as::<Facts>(ids)?;
+        let mut each = ids.iter().zip(facts);
+        self.values.read(ids, |values| {
+            let (&id, facts) = each.next().expect("each brick has facts and values");
+            let keeps_mask = self.flags[id as usize].keeps_mask;
+            out.push(Brick {
+                values: bytemuck::pod_read_unaligned(values),
+                active: facts.active,
+                keeps_mask,
+            });
+        })?;
+        Ok(out)
     }
 }
+
 /// Keeps one copy of each run of values, in one growing array, and gives back where it lies.
 pub struct Interner<T> {
     by_hash: HashMap<u128, u32>,
@@ -188,6 +233,12 @@ impl<T: bytemuck::Pod> Interner<T> {
         self.by_hash.entry(hash).or_insert(at);
         self.items.extend_from_slice(run);
         at
+    }
+
+    /// Forgets what only [`Interner::intern`] needs: there will be no more runs.
+    pub fn seal(&mut self) {
+        self.by_hash = HashMap::new();
+        self.items.shrink_to_fit();
     }
 
     /// Every run, one after another.

@@ -3,15 +3,19 @@
 //! `cargo run --release -p xtask -- help` lists the tasks. None of them is part of the tests: they need
 //! peers from Debian (`libopenvdb-dev libboost-dev libtbb-dev libimath-dev g++`) or volumes of your own.
 
+mod beside;
 mod cache;
 mod clusters;
 mod formats;
 mod kmeans;
+mod load;
+mod measured;
 mod mutate;
 mod openvdb;
 mod peers;
 mod pictures;
 mod read;
+mod scale;
 mod sequence;
 mod size;
 mod stress;
@@ -61,6 +65,12 @@ enum Bench {
     Read(read::Args),
     /// Builds with a cache: cold, without a change, after an edit, at another quality, at another level of zstd
     Cache(cache::Args),
+    /// A long sequence beside a short one: time, memory, cores in use
+    Scale(scale::Args),
+    /// Whole builds beside NanoVDB's converter, the BC7 stage beside its encoder, files beside zstd
+    Peers(beside::Args),
+    /// From a pack in the page cache to the bytes that a GPU is given, beside reading the .vdb
+    Load(load::Args),
     /// Every format and range on each volume: bytes, PSNR, largest error, seconds; and the tree beside
     /// the thesis's layout
     Formats(formats::Args),
@@ -80,6 +90,9 @@ fn main() -> Result<(), Box<dyn Error>> {
     match Cli::parse().task {
         Task::Bench(Bench::Read(args)) => read::bench(&args),
         Task::Bench(Bench::Cache(args)) => cache::bench(&args),
+        Task::Bench(Bench::Scale(args)) => scale::bench(&args),
+        Task::Bench(Bench::Peers(args)) => beside::bench(&args),
+        Task::Bench(Bench::Load(args)) => load::bench(&args),
         Task::Bench(Bench::Formats(args)) => formats::bench(&args),
         Task::Bench(Bench::Clusters(args)) => clusters::bench(&args),
         Task::Bench(Bench::Kmeans(args)) => kmeans::bench(&args),

@@ -35,3 +35,11 @@ pub fn compile_openvdb(source: &str) -> Result<PathBuf, Box<dyn Error>> {
             .into()),
     }
 }
+
+/// Writes raw figures where they are asked for.
+///
+/// # Errors
+/// When the file cannot be written.
+pub fn write(path: Option<&Path>, figures: &serde_json::Value) -> Result<(), Box<dyn Error>> {
+    path.map_or(Ok(()), |path| Ok(std::fs::write(path, serde_json::to_string(figures)?)?))
+}

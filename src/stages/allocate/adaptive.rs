@@ -2,12 +2,13 @@
 
 use std::io;
 
+use super::choices::AT_ONCE;
 use super::search::GridSearch;
 use super::size::at_size;
 use super::{AllocateError, Allocation};
 use crate::settings::{FRAME_MARGIN_DB, Quality};
 use crate::stages::dedup::SequenceTree;
-use crate::stages::encodings::{Encodings, KeptCodec, Kind};
+use crate::stages::encodings::Encodings;
 
 /// One grid to be allocated.
 pub struct AdaptiveGrid<'a> {
@@ -30,9 +31,6 @@ pub struct Target {
     pub fixed_bytes: u64,
 }
 
-/// BC7 takes twenty times as long as all others together, and is tried when it is asked for.
-const AT_ONCE: [Kind; 3] = [Kind::Plain, Kind::Texels(KeptCodec::Bc4), Kind::Texels(KeptCodec::Unorm8)];
-
 /// Gives each brick of each grid its codec. `advance` hears of bricks that BC7 was tried on.
 ///
 /// # Errors
@@ -46,7 +44,7 @@ pub fn adaptive(
     for mut grid in grids {
         let all: Vec<u32> = (0..grid.tree.pool.len()).collect();
         grid.encodings.make(grid.tree, &all, &AT_ONCE, |_| ())?;
-        searches.push(GridSearch::new(grid));
+        searches.push(GridSearch::new(grid)?);
     }
     let picks = match target.quality {
         Quality::Psnr(db) => {
@@ -54,7 +52,7 @@ pub fn adaptive(
             searches.iter_mut().map(|s| s.at_psnr(db, floor, advance)).collect::<io::Result<_>>()?
         }
         Quality::MaxError(bound) => {
-            let within = |s: &mut GridSearch| s.within(bound.absolute(s.peak, s.voxel_size), advance);
+            let within = |s: &mut GridSearch| s.within(bound.absolute(s.table.peak, s.voxel_size), advance);
             searches.iter_mut().map(within).collect::<io::Result<_>>()?
         }
         Quality::BitsPerVoxel(bits) => {

@@ -27,11 +27,10 @@ pub fn clustered(
     let mut allocation = uniform(tree, encodings, codec);
     let sequence = allocation.sequence;
     let (mut ids, mut points) = (Vec::new(), Vec::new());
-    let mut bricks = Vec::new();
     for first in (0..tree.pool.len()).step_by(BRICKS_IN_FLIGHT as usize) {
-        bricks.clear();
         let window: Vec<u32> = (first..(first + BRICKS_IN_FLIGHT).min(tree.pool.len())).collect();
-        tree.read(&window, &mut bricks)?;
+        tree.fetch(&window)?;
+        let bricks = tree.pool.read(&window)?;
         for (id, brick) in window.into_iter().zip(&bricks) {
             if variance(brick) <= clustering.variance {
                 ids.push(id);
@@ -78,8 +77,7 @@ pub fn clustered(
     for (ids, members) in
         ids.chunks(BRICKS_IN_FLIGHT as usize).zip(found.members.chunks(BRICKS_IN_FLIGHT as usize))
     {
-        bricks.clear();
-        tree.read(ids, &mut bricks)?;
+        let bricks = tree.pool.read(ids)?;
         for ((&id, &member), brick) in ids.iter().zip(members).zip(&bricks) {
             let id = id as usize;
             allocation.norms[id] =

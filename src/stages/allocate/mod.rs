@@ -4,6 +4,7 @@
 //! D + λR, with one λ for all (Shoham & Gersho 1988).
 
 mod adaptive;
+mod choices;
 mod cluster;
 pub mod kmeans;
 mod rung;

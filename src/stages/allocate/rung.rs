@@ -1,7 +1,6 @@
 //! The ways to code a brick.
 
 use crate::codec::Codec;
-use crate::stages::encodings::{Cost, Encodings, KeptCodec};
 
 /// One of the ways.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -43,17 +42,24 @@ impl Rung {
         }
     }
 
-    /// What it does to a brick that borrows nothing; `None` while it has not been tried.
-    pub fn cost(self, encodings: &Encodings, brick: u32) -> Option<Cost> {
+    /// How many have a cost that depends on the brick alone.
+    pub const OWN: usize = 6;
+
+    /// Its place among those.
+    pub fn own(self) -> Option<usize> {
         match self {
-            Self::Empty => encodings.plain(brick).map(|plain| plain.empty),
-            Self::Constant => encodings.plain(brick).map(|plain| plain.constant),
-            Self::F16 => encodings.plain(brick).map(|plain| plain.f16),
-            Self::F32 => Some(Cost::NONE),
-            Self::Borrowed => Some(Cost::IMPOSSIBLE),
-            Self::Bc7 => encodings.cost(brick, KeptCodec::Bc7),
-            Self::Bc4 => encodings.cost(brick, KeptCodec::Bc4),
-            Self::Unorm8 => encodings.cost(brick, KeptCodec::Unorm8),
+            Self::Empty => Some(0),
+            Self::Constant => Some(1),
+            Self::Bc7 => Some(2),
+            Self::Bc4 => Some(3),
+            Self::Unorm8 => Some(4),
+            Self::F16 => Some(5),
+            Self::Borrowed | Self::F32 => None,
         }
+    }
+
+    /// Bits of the texels of a brick.
+    pub fn texel_bits(self) -> u32 {
+        8 * self.codec().layout().brick_bytes() as u32
     }
 }

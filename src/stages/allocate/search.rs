@@ -12,12 +12,14 @@ use std::sync::LazyLock;
 use rayon::prelude::*;
 
 use super::adaptive::AdaptiveGrid;
+use super::choices::{Table, costs};
 use super::rung::Rung;
 use super::share::{Loan, loans};
 use super::{Allocation, Coding, Shape};
 use crate::stages::dedup::{Payload, SequenceTree};
-use crate::stages::encodings::{Cost, Encodings, KeptCodec, Kind};
-use crate::volume::ValueRange;
+use crate::stages::encodings::{Cost, Encodings, KeptCodec, Kind, Tried};
+use crate::trace;
+use crate::volume::{BRICKS_IN_FLIGHT, ValueRange};
 
 /// A step is 1.1 % of λ, under 0.05 dB of PSNR.
 const STEPS_PER_OCTAVE: u32 = 64;
@@ -35,27 +37,13 @@ fn lambda(step: u32) -> f64 {
     STEPS.get(step as usize).copied().unwrap_or(0.0)
 }
 
-/// What each rung comes to for a brick, by [`Rung::ALL`]. Looked up some hundred times a brick.
-#[derive(Clone, Copy)]
-struct Choices {
-    /// Squared peaks over all users and over all the voxels that texels give.
-    distortion: [f64; Rung::ALL.len()],
-    /// Squared error over active voxels.
-    active_squares: [f64; Rung::ALL.len()],
-    /// Texels and all records.
-    bits: [f64; Rung::ALL.len()],
-}
-
 /// Steps of λ, a quarter of an octave, that are one when it comes to who lends: 0.4 dB.
 const LENDING_STEPS: u32 = STEPS_PER_OCTAVE / 4;
 
 /// Bricks that a λ this much larger, an octave, would have made coarser may be so where there is room for it.
 const SLACK_STEPS: u32 = STEPS_PER_OCTAVE;
 
-/// An L3 record is three words.
-pub(super) const RECORD_BITS: u32 = 96;
-
-/// Sums of squares are sums of rounded roots; a target is met with this much to spare.
+/// Sums of squares are sums of rounded figures (2^-24 each); a target is met with this much to spare.
 const ROUNDING: f64 = 1.0 - 1e-6;
 
 /// One grid and what is known of it.
@@ -63,27 +51,19 @@ pub(super) struct GridSearch<'a> {
     pub(super) tree: &'a mut SequenceTree,
     encodings: Encodings,
     pub(super) voxel_size: f64,
-    /// How often each brick is used over all frames.
-    uses: Vec<u32>,
-    /// How many L3 records each brick has: one in every run that it is in.
-    pub(super) records: Vec<u32>,
+    pub(super) table: Table,
     /// The coarsest step that each brick may have, for the sake of the frames it is in.
     pub(super) least_step: Vec<u32>,
-    choices: Vec<Choices>,
     /// The bricks that this search asked for in BC7. A cache may know of more, but what it knows by chance must not
     /// lead the search elsewhere.
     bc7_is_tried: Vec<bool>,
-    /// What each brick may borrow.
-    loans: Vec<Option<Loan>>,
     /// The rung of bricks that lend their texels.
     lends: Vec<Option<Rung>>,
-    /// Maximum less minimum of active values.
-    pub(super) peak: f64,
     active_voxels: u64,
 }
 
 impl<'a> GridSearch<'a> {
-    pub(super) fn new(grid: AdaptiveGrid<'a>) -> Self {
+    pub(super) fn new(grid: AdaptiveGrid<'a>) -> io::Result<Self> {
         let tree = grid.tree;
         let mut uses = vec![0; tree.brick_ranges.len()];
         for frame in &tree.frames {
@@ -91,85 +71,39 @@ impl<'a> GridSearch<'a> {
         }
         let mut records = vec![0; uses.len()];
         for &record in tree.runs.items() {
-            if let Payload::Brick(id) = tree.records[record as usize].payload {
+            if let Payload::Brick(id) = tree.record(record).payload() {
                 records[id as usize] += 1;
             }
         }
         let peak = tree.active_range().map_or(0.0, ValueRange::width);
-        let none = [0.0; Rung::ALL.len()];
         let mut search = Self {
-            choices: vec![Choices { distortion: none, active_squares: none, bits: none }; uses.len()],
             least_step: vec![0; uses.len()],
             bc7_is_tried: vec![false; uses.len()],
-            loans: vec![None; uses.len()],
             lends: vec![None; uses.len()],
-            peak,
             active_voxels: tree.frames.iter().map(|f| f.stats.active_leaf_voxels).sum(),
             voxel_size: grid.voxel_size,
-            uses,
-            records,
+            table: Table::new(uses, records, peak),
             encodings: grid.encodings,
             tree,
         };
-        (0..search.choices.len()).for_each(|brick| search.weigh(brick, &Rung::ALL));
-        search
-    }
-
-    /// Notes what some rungs come to for a brick.
-    fn weigh(&mut self, brick: usize, rungs: &[Rung]) {
-        for &rung in rungs {
-            let (i, cost) = (rung as usize, self.cost(brick, rung));
-            let texels = 8 * rung.codec().layout().brick_bytes() as u32;
-            let records = if rung == Rung::Empty { 0 } else { self.records[brick] };
-            let distortion = self.in_peaks(brick, cost.norm);
-            let choices = &mut self.choices[brick];
-            choices.distortion[i] = distortion;
-            choices.active_squares[i] = cost.active_norm.powi(2);
-            choices.bits[i] = f64::from(texels) + f64::from(RECORD_BITS) * f64::from(records);
+        let all: Vec<u32> = (0..search.table.len() as u32).collect();
+        for ids in all.chunks(BRICKS_IN_FLIGHT as usize) {
+            for (&id, (costs, _)) in ids.iter().zip(costs(&search.encodings, ids, &search.bc7_is_tried)?) {
+                Rung::ALL.into_iter().for_each(|rung| search.table.weigh(id, rung, costs[rung as usize]));
+            }
         }
+        Ok(search)
     }
 
-    fn set_loan(&mut self, brick: usize, loan: Option<Loan>) {
-        self.loans[brick] = loan;
-        self.weigh(brick, &[Rung::Borrowed]);
+    /// The squared peaks that `voxels` may err by together at some PSNR.
+    fn allowance(voxels: u64, psnr: f64) -> f64 {
+        voxels as f64 * 10f64.powf(-psnr / 10.0) * ROUNDING
     }
 
-    /// The squared error that `voxels` may have together at some PSNR.
-    fn allowance(&self, voxels: u64, psnr: f64) -> f64 {
-        voxels as f64 * self.peak * self.peak * 10f64.powf(-psnr / 10.0) * ROUNDING
-    }
-
+    /// The PSNR of so many squared peaks. Without a peak there is none above any error.
     fn psnr(&self, voxels: u64, squares: f64) -> f64 {
-        10.0 * (voxels as f64 * self.peak * self.peak / squares).log10()
-    }
-
-    /// The cost of a codec that was not tried is none.
-    fn cost(&self, brick: usize, rung: Rung) -> Cost {
-        match rung {
-            Rung::Borrowed => self.loans[brick].map_or(Cost::IMPOSSIBLE, |loan| loan.cost),
-            Rung::Bc7 if !self.bc7_is_tried[brick] => Cost::NONE,
-            rung => rung.cost(&self.encodings, brick as u32).unwrap_or(Cost::NONE),
-        }
-    }
-
-    /// A brick's error in squared peaks, over all its users and over all the voxels that its texels give.
-    fn distortion(&self, brick: usize, rung: Rung) -> f64 {
-        self.choices[brick].distortion[rung as usize]
-    }
-
-    fn in_peaks(&self, brick: usize, norm: f64) -> f64 {
-        // Where all active values are the same, nothing but no error will do.
-        let peak = if self.peak > 0.0 { self.peak } else { f64::MIN_POSITIVE };
-        if norm == 0.0 { 0.0 } else { f64::from(self.uses[brick]) * (norm / peak) * (norm / peak) }
-    }
-
-    fn active_squares(&self, brick: usize, rung: Rung) -> f64 {
-        self.choices[brick].active_squares[rung as usize]
-    }
-
-    /// The bits of a brick's texels and of all its records.
-    fn bits(&self, brick: usize, rung: Rung) -> f64 {
-        self.choices[brick].bits[rung as usize]
+        let voxels = if self.table.peak > 0.0 { voxels as f64 } else { 0.0 };
+        10.0 * (voxels / squares).log10()
     }
 
     /// The rung with the least D + λR; of equals the cheapest.
@@ -180,13 +114,13 @@ impl<'a> GridSearch<'a> {
         let step = step.max(self.least_step[brick]);
         if step == 0 {
             // The coarsest there is: no error is too large.
-            let possible = |rung: &Rung| self.cost(brick, *rung).norm.is_finite();
+            let possible = |rung: &Rung| self.table.distortion(brick, *rung).is_finite();
             return Rung::ALL.into_iter().find(possible).unwrap_or(Rung::F32);
         }
-        let (lambda, Choices { distortion, bits, .. }) = (lambda(step), &self.choices[brick]);
+        let lambda = lambda(step);
         let (mut best, mut least) = (Rung::F32, f64::INFINITY);
         for rung in Rung::ALL {
-            let cost = distortion[rung as usize] + lambda * bits[rung as usize];
+            let cost = self.table.distortion(brick, rung) + lambda * self.table.bits(brick, rung);
             if cost < least {
                 (best, least) = (rung, cost);
             }
@@ -195,13 +129,14 @@ impl<'a> GridSearch<'a> {
     }
 
     pub(super) fn picks(&self, step: u32) -> Vec<Rung> {
-        (0..self.uses.len()).into_par_iter().map(|brick| self.pick(brick, step)).collect()
+        (0..self.table.len()).into_par_iter().map(|brick| self.pick(brick, step)).collect()
     }
 
     /// The squared error of all frames over active voxels, summed in the order of the bricks.
     pub(super) fn squares(&self, picks: &[Rung]) -> f64 {
         let each = picks.iter().enumerate();
-        each.map(|(brick, &rung)| f64::from(self.uses[brick]) * self.active_squares(brick, rung)).sum()
+        each.map(|(brick, &rung)| f64::from(self.table.uses[brick]) * self.table.active_squares(brick, rung))
+            .sum()
     }
 
     /// Tries what was picked without having been tried. Whether there was any.
@@ -213,9 +148,11 @@ impl<'a> GridSearch<'a> {
         let unknown = picks.filter(|&(id, rung)| rung == Rung::Bc7 && !self.bc7_is_tried[id as usize]);
         let unknown: Vec<u32> = unknown.map(|(id, _)| id).collect();
         self.encodings.make(self.tree, &unknown, &[Kind::Texels(KeptCodec::Bc7)], advance)?;
-        for &id in &unknown {
-            self.bc7_is_tried[id as usize] = true;
-            self.weigh(id as usize, &[Rung::Bc7]);
+        for ids in unknown.chunks(BRICKS_IN_FLIGHT as usize) {
+            for (&id, cost) in ids.iter().zip(self.encodings.costs(ids, KeptCodec::Bc7)?) {
+                self.bc7_is_tried[id as usize] = true;
+                self.table.weigh(id, Rung::Bc7, cost);
+            }
         }
         Ok(!unknown.is_empty())
     }
@@ -230,7 +167,7 @@ impl<'a> GridSearch<'a> {
         self.find_loans(&alone, step, advance)?;
         let (_, together) = self.at_psnr_with_loans(psnr, floor, advance)?;
         let bits =
-            |picks: &[Rung]| (0..).zip(picks).map(|(brick, &rung)| self.bits(brick, rung)).sum::<f64>();
+            |picks: &[Rung]| (0..).zip(picks).map(|(brick, &rung)| self.table.bits(brick, rung)).sum::<f64>();
         if bits(&together) < bits(&alone) {
             return Ok(together);
         }
@@ -244,9 +181,11 @@ impl<'a> GridSearch<'a> {
         floor: f64,
         advance: &mut dyn FnMut(u64),
     ) -> io::Result<(u32, Vec<Rung>)> {
-        let allowed = self.allowance(self.active_voxels, psnr);
+        let allowed = Self::allowance(self.active_voxels, psnr);
         loop {
+            let span = trace::span("search");
             let step = first_step(|step| self.squares(&self.picks(step)) <= allowed);
+            drop(span);
             let fine = self.picks(step);
             if self.try_unknown((0..).zip(fine.iter().copied()), advance)? {
                 continue;
@@ -257,9 +196,9 @@ impl<'a> GridSearch<'a> {
                 if squares <= allowed {
                     break;
                 }
-                let (brick, uses) = (switch.brick, f64::from(self.uses[switch.brick]));
-                squares -= uses * self.active_squares(brick, picks[brick]);
-                squares += uses * self.active_squares(brick, switch.to);
+                let (brick, uses) = (switch.brick, f64::from(self.table.uses[switch.brick]));
+                squares -= uses * self.table.active_squares(brick, picks[brick]);
+                squares += uses * self.table.active_squares(brick, switch.to);
                 picks[brick] = switch.to;
             }
             // Differences were added up; the sum itself decides.
@@ -279,8 +218,9 @@ impl<'a> GridSearch<'a> {
         let coarser = self.picks(step.saturating_sub(SLACK_STEPS));
         let (before, mut squares) = (picks.to_vec(), self.squares(picks));
         for switch in switches(0, self, &coarser, &before).into_iter().rev() {
-            let (brick, uses) = (switch.brick, f64::from(self.uses[switch.brick]));
-            let more = self.active_squares(brick, coarser[brick]) - self.active_squares(brick, picks[brick]);
+            let (brick, uses) = (switch.brick, f64::from(self.table.uses[switch.brick]));
+            let more = self.table.active_squares(brick, coarser[brick])
+                - self.table.active_squares(brick, picks[brick]);
             if squares + uses * more <= allowed {
                 squares += uses * more;
                 picks[brick] = coarser[brick];
@@ -306,30 +246,31 @@ impl<'a> GridSearch<'a> {
         while self.try_unknown((0..).zip(compared.iter().copied()), advance)? {
             compared = self.picks(near);
         }
-        let is_whole = |id: &u32| self.encodings.is_whole(*id) && compared[*id as usize] != Rung::Empty;
-        let borrowers: Vec<u32> = (0..picks.len() as u32).filter(is_whole).collect();
-        let lends = |&id: &u32| KeptCodec::of(compared[id as usize].codec()).map(|codec| (id, codec));
-        let lenders: Vec<(u32, KeptCodec)> = borrowers.iter().filter_map(lends).collect();
-        let offers = loans(&mut self.encodings, self.tree, &borrowers, &lenders)?;
+        // Who may borrow, and of those who has texels that others can use.
+        let whole: Vec<bool> = (0..picks.len() as u32).map(|id| self.encodings.is_whole(id)).collect();
+        let borrows = |id: u32| whole[id as usize] && compared[id as usize] != Rung::Empty;
+        let lends = |id: u32| borrows(id).then(|| KeptCodec::of(compared[id as usize].codec())).flatten();
+        let (table, least_step) = (&self.table, &self.least_step);
         let gain = |id: u32, loan: &Loan| {
             let brick = id as usize;
-            let lambda = lambda(step.max(self.least_step[brick]));
-            let own = self.distortion(brick, picks[brick]) + lambda * self.bits(brick, picks[brick]);
-            own - self.in_peaks(brick, loan.cost.norm) - lambda * self.bits(brick, Rung::Borrowed)
+            let lambda = lambda(step.max(least_step[brick]));
+            let own = table.distortion(brick, picks[brick]) + lambda * table.bits(brick, picks[brick]);
+            let borrowed = table.in_peaks(loan.cost.norm) * f64::from(table.uses[brick]);
+            own - borrowed - lambda * table.bits(brick, Rung::Borrowed)
         };
-        let mut order: Vec<(f64, u32, Loan)> = borrowers
-            .iter()
-            .zip(&offers)
-            .flat_map(|(&id, offers)| offers.iter().map(move |loan| (id, *loan)))
-            .filter(|(_, loan)| picks[loan.lender as usize] == compared[loan.lender as usize])
-            .map(|(id, loan)| (gain(id, &loan), id, loan))
-            .filter(|(gain, ..)| *gain > 0.0)
-            .collect();
+        // A fifth of the bricks has an offer worth taking.
+        let mut order: Vec<(f64, u32, Loan)> = Vec::new();
+        loans(&self.encodings, self.tree, borrows, lends, |id, loans| {
+            let as_compared = |loan: &&Loan| picks[loan.lender as usize] == compared[loan.lender as usize];
+            let offers = loans.iter().filter(as_compared).map(|loan| (gain(id, loan), id, *loan));
+            order.extend(offers.filter(|(gain, ..)| *gain > 0.0));
+        })?;
         order.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         for (_, id, loan) in order {
             let (id, lender) = (id as usize, loan.lender as usize);
-            if self.loans[id].is_none() && self.lends[id].is_none() && self.loans[lender].is_none() {
-                self.set_loan(id, Some(loan));
+            let table = &mut self.table;
+            if table.loan(id).is_none() && self.lends[id].is_none() && table.loan(lender).is_none() {
+                table.lend(id as u32, loan);
                 self.lends[lender] = Some(picks[lender]);
             }
         }
@@ -337,18 +278,21 @@ impl<'a> GridSearch<'a> {
     }
 
     pub(super) fn forget_loans(&mut self) {
-        (0..self.loans.len()).for_each(|brick| self.set_loan(brick, None));
+        self.table.forget_loans();
         self.lends.fill(None);
     }
 
     pub(super) fn within(&mut self, bound: f64, advance: &mut dyn FnMut(u64)) -> io::Result<Vec<Rung>> {
+        let all: Vec<u32> = (0..self.table.len() as u32).collect();
+        let fits = |cost: &Cost| cost.norm.is_finite() && f64::from(cost.max) <= bound;
         loop {
-            let fits = |brick, rung| {
-                let cost = self.cost(brick, rung);
-                cost.norm.is_finite() && f64::from(cost.max) <= bound
-            };
-            let cheapest = |brick| Rung::ALL.into_iter().find(|&r| fits(brick, r)).unwrap_or(Rung::F32);
-            let picks: Vec<Rung> = (0..self.uses.len()).map(cheapest).collect();
+            let mut picks = Vec::with_capacity(all.len());
+            for ids in all.chunks(BRICKS_IN_FLIGHT as usize) {
+                let costs = costs(&self.encodings, ids, &self.bc7_is_tried)?;
+                picks.extend(costs.iter().map(|(costs, _)| {
+                    Rung::ALL.into_iter().find(|&rung| fits(&costs[rung as usize])).unwrap_or(Rung::F32)
+                }));
+            }
             if !self.try_unknown((0..).zip(picks.iter().copied()), advance)? {
                 return Ok(picks);
             }
@@ -363,7 +307,7 @@ impl<'a> GridSearch<'a> {
     /// That of the worst frame.
     pub(super) fn worst_frame(&self, picks: &[Rung]) -> f64 {
         let frames = self.tree.frames.iter().map(|frame| {
-            let square = |id: u32| self.active_squares(id as usize, picks[id as usize]);
+            let square = |id: u32| self.table.active_squares(id as usize, picks[id as usize]);
             self.psnr(frame.stats.active_leaf_voxels, self.tree.frame_bricks(frame).map(square).sum())
         });
         // Where there is no error, or no voxel to err, there is no worst.
@@ -381,11 +325,11 @@ impl<'a> GridSearch<'a> {
     ) -> io::Result<bool> {
         // All are judged before loans are called in for the sake of some.
         let low: Vec<(usize, f64)> = (0..self.tree.frames.len())
-            .map(|f| (f, self.allowance(self.tree.frames[f].stats.active_leaf_voxels, floor)))
+            .map(|f| (f, Self::allowance(self.tree.frames[f].stats.active_leaf_voxels, floor)))
             .filter(|&(f, allowed)| {
                 let bricks = || self.tree.frame_bricks(&self.tree.frames[f]);
                 let squares: f64 =
-                    bricks().map(|id| self.active_squares(id as usize, picks[id as usize])).sum();
+                    bricks().map(|id| self.table.active_squares(id as usize, picks[id as usize])).sum();
                 // What no step meets is met as nearly as the last one does.
                 squares > allowed && bricks().any(|id| self.least_step[id as usize] < LAST_STEP)
             })
@@ -400,7 +344,7 @@ impl<'a> GridSearch<'a> {
                 let squares = |step| -> f64 {
                     bricks
                         .iter()
-                        .map(|&id| self.active_squares(id as usize, self.pick(id as usize, step)))
+                        .map(|&id| self.table.active_squares(id as usize, self.pick(id as usize, step)))
                         .sum()
                 };
                 let step = first_step(|step| squares(step) <= allowed);
@@ -426,56 +370,62 @@ impl<'a> GridSearch<'a> {
         Ok(!low.is_empty())
     }
 
-    /// Ends every loan that some bricks are part of: they are to become finer, and their texels others.
+    /// Ends every loan that some bricks, ascending, are part of: they are to become finer, and their texels others.
     fn call_in_loans(&mut self, bricks: &[u32]) {
         for &id in bricks {
-            self.set_loan(id as usize, None);
             self.lends[id as usize] = None;
         }
-        for brick in 0..self.loans.len() {
-            if self.loans[brick].is_some_and(|loan| self.lends[loan.lender as usize].is_none()) {
-                self.set_loan(brick, None);
-            }
-        }
+        let lends = &self.lends;
+        self.table.keep_loans(|id, loan| {
+            lends[loan.lender as usize].is_some() && bricks.binary_search(&id).is_err()
+        });
     }
 
     pub(super) fn finish(self, picks: &[Rung]) -> io::Result<Allocation> {
-        let costs: Vec<f64> = (0..).zip(picks).map(|(brick, &rung)| self.cost(brick, rung).norm).collect();
-        let mut allocation = Allocation::new(self.encodings, Coding::Empty);
-        for (brick, &rung) in picks.iter().enumerate() {
-            allocation.norms[brick] = costs[brick];
-            allocation.codings[brick] = match rung {
-                Rung::Empty => Coding::Empty,
-                Rung::Constant => {
-                    let plain = allocation.encodings.plain(brick as u32);
-                    Coding::Constant(plain.expect("what was picked was tried").value)
-                }
-                Rung::Borrowed => continue,
-                rung => Coding::Own(rung.codec()),
-            };
+        let Self { tree, encodings, bc7_is_tried, table, .. } = self;
+        let loans = table.into_loans();
+        let all: Vec<u32> = (0..picks.len() as u32).collect();
+        let (mut norms, mut codings) = (Vec::with_capacity(all.len()), Vec::with_capacity(all.len()));
+        for ids in all.chunks(BRICKS_IN_FLIGHT as usize) {
+            for (&id, (costs, value)) in ids.iter().zip(costs(&encodings, ids, &bc7_is_tried)?) {
+                let rung = picks[id as usize];
+                norms.push(
+                    loans
+                        .get(&id)
+                        .filter(|_| rung == Rung::Borrowed)
+                        .map_or(costs[rung as usize].norm, |l| l.cost.norm),
+                );
+                codings.push(match rung {
+                    Rung::Empty | Rung::Borrowed => Coding::Empty,
+                    Rung::Constant => Coding::Constant(value),
+                    rung => Coding::Own(rung.codec()),
+                });
+            }
         }
+        let mut allocation = Allocation::new(encodings, Coding::Empty);
+        (allocation.norms, allocation.codings) = (norms, codings);
         for brick in (0..picks.len()).filter(|&brick| picks[brick] == Rung::Borrowed) {
-            let loan = self.loans[brick].expect("who borrows has a loan");
+            let loan = loans[&(brick as u32)];
             allocation.ranges[brick] = loan.range;
             let lender = loan.lender as usize;
             allocation.codings[brick] = match allocation.codings[lender] {
                 Coding::Own(codec) => {
                     let kept = KeptCodec::of(codec).expect("raw texels are not lent");
-                    let (bytes, axis) = allocation.encodings.texels(&[loan.lender], kept)?.remove(0);
-                    allocation.shapes.push(Shape { codec, bytes, axis });
+                    let Tried { bytes, axes, .. } = allocation.encodings.texels(&[loan.lender], kept)?;
+                    allocation.shapes.push(Shape { codec, bytes, axis: axes[0] });
                     allocation.codings[lender] = Coding::Shared(allocation.shapes.len() as u32 - 1);
                     allocation.codings[lender]
                 }
                 shared => shared,
             };
         }
-        allocation.tighten(self.tree);
+        allocation.tighten(tree);
         let is_empty = |id: u32| picks[id as usize] == Rung::Empty;
         let square = |id: u32| allocation.norms[id as usize].powi(2);
-        let frames = self.tree.frames.iter();
+        let frames = tree.frames.iter();
         allocation.empty_squares =
-            frames.map(|f| self.tree.frame_bricks(f).filter(|&id| is_empty(id)).map(square).sum()).collect();
-        self.tree.prune(is_empty);
+            frames.map(|f| tree.frame_bricks(f).filter(|&id| is_empty(id)).map(square).sum()).collect();
+        tree.prune(is_empty);
         Ok(allocation)
     }
 }
@@ -509,8 +459,13 @@ pub(super) fn switches(grid: usize, search: &GridSearch, coarse: &[Rung], fine: 
     let mut switches: Vec<Switch> = differ
         .map(|brick| {
             let (from, to) = (coarse[brick], fine[brick]);
-            let less = search.distortion(brick, from) - search.distortion(brick, to);
-            Switch { grid, brick, to, gain: less / (search.bits(brick, to) - search.bits(brick, from)) }
+            let less = search.table.distortion(brick, from) - search.table.distortion(brick, to);
+            Switch {
+                grid,
+                brick,
+                to,
+                gain: less / (search.table.bits(brick, to) - search.table.bits(brick, from)),
+            }
         })
         .collect();
     switches.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.brick.cmp(&b.brick)));

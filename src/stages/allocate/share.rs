@@ -21,7 +21,8 @@ use serde::{Deserialize, Serialize};
 use crate::cache::{Key, Stage};
 use crate::codec::{BrickRange, SequenceRange, decode};
 use crate::stages::dedup::SequenceTree;
-use crate::stages::encodings::{Batch, Cost, Encodings, KeptCodec, active};
+use crate::stages::encodings::{Batch, Cost, Encodings, KeptCodec, Tried};
+use crate::trace;
 use crate::volume::{BRICK_VOXELS, Brick, Mask512};
 
 const STAGE: Stage = Stage { name: "share", version: 1, travels: true };
@@ -67,66 +68,77 @@ struct Lender {
     coarse: [f32; COARSE],
 }
 
-/// For each of `borrowers`, ascending, the nearest of `lenders`, ascending, each with its codec: the closest first.
-pub(super) fn loans(
-    encodings: &mut Encodings,
-    tree: &mut SequenceTree,
-    borrowers: &[u32],
-    lenders: &[(u32, KeptCodec)],
-) -> io::Result<Vec<Vec<Loan>>> {
-    let batches = encodings.batches().len();
-    let lenders_of: Vec<&[(u32, KeptCodec)]> =
-        encodings.batches().iter().map(|batch| part(lenders, |lender| lender.0, &batch.ids)).collect();
-    let comparisons: Vec<Comparison> = (0..batches)
-        .map(|batch| {
-            let around = around(encodings.batches(), batch);
-            let borrowers = part(borrowers, |id| *id, &encodings.batches()[batch].ids);
-            Comparison { batch, borrowers, lenders: lenders_of[around.clone()].concat(), around }
-        })
-        .collect();
-    if let Some(cache) = encodings.cache() {
-        cache.prefetch(comparisons.iter().filter_map(|comparison| comparison.key(encodings, tree)));
-    }
-    let known: Vec<(Option<Key>, Option<Offers>)> =
-        comparisons.par_iter().map(|comparison| comparison.known(encodings, tree)).collect();
+/// Batches whose offers are looked for in the cache together: some requests to a remote one at a time, and the offers
+/// of no more bricks in memory than those of a few frames.
+const BATCHES: usize = 32;
 
+/// Visits each brick that may borrow, ascending, with the nearest of those that lend, the closest first.
+pub(super) fn loans(
+    encodings: &Encodings,
+    tree: &mut SequenceTree,
+    borrows: impl Fn(u32) -> bool,
+    lends: impl Fn(u32) -> Option<KeptCodec>,
+    mut visit: impl FnMut(u32, &[Loan]),
+) -> io::Result<()> {
+    let lenders = |ids: &Range<u32>| -> Vec<(u32, KeptCodec)> {
+        ids.clone().filter_map(|id| Some((id, lends(id)?))).collect()
+    };
     let mut near = Near::default();
-    let mut found = Vec::with_capacity(borrowers.len());
-    for (comparison, (key, known)) in comparisons.iter().zip(known) {
-        crate::interrupt::check()?;
-        let offers = match known {
-            Some(offers) => offers,
-            None => {
-                let mut bricks = Vec::with_capacity(comparison.borrowers.len());
-                tree.read(comparison.borrowers, &mut bricks)?;
-                near.move_to(encodings, &comparison.around, &lenders_of)?;
-                let offers = comparison.nearest(encodings, &bricks, &near);
-                if let Some((cache, key)) = encodings.cache().zip(key) {
-                    cache.put(&key, &offers);
-                }
-                offers
+    let batches: Vec<usize> = (0..encodings.batches().len()).collect();
+    for window in batches.chunks(BATCHES) {
+        let comparison = |&batch: &usize| {
+            let around = around(encodings.batches(), batch);
+            let batches = &encodings.batches()[around.clone()];
+            Comparison {
+                batch,
+                borrowers: encodings.batches()[batch].ids.clone().filter(|&id| borrows(id)).collect(),
+                lenders: batches.iter().flat_map(|batch| lenders(&batch.ids)).collect(),
+                around,
             }
         };
-        let loan = |offer: Offer| Loan {
-            lender: comparison.lenders[offer.lender as usize].0,
-            range: BrickRange::from_word(offer.range),
-            cost: offer.cost,
-        };
-        found.extend(offers.into_iter().map(|offers| offers.into_iter().map(loan).collect::<Vec<_>>()));
+        let comparisons: Vec<Comparison> = window.iter().map(comparison).collect();
+        if let Some(cache) = encodings.cache() {
+            cache.prefetch(comparisons.iter().filter_map(|comparison| comparison.key(encodings, tree)));
+        }
+        let known: Vec<(Option<Key>, Option<Offers>)> =
+            comparisons.par_iter().map(|comparison| comparison.known(encodings, tree)).collect();
+        for (comparison, (key, known)) in comparisons.iter().zip(known) {
+            crate::interrupt::check()?;
+            let offers = match known {
+                Some(offers) => offers,
+                None => {
+                    tree.fetch(&comparison.borrowers)?;
+                    near.move_to(encodings, &comparison.around, &lenders)?;
+                    let offers = comparison.nearest(encodings, tree, &near)?;
+                    if let Some((cache, key)) = encodings.cache().zip(key) {
+                        cache.put(&key, &offers);
+                    }
+                    offers
+                }
+            };
+            let loan = |offer: Offer| Loan {
+                lender: comparison.lenders[offer.lender as usize].0,
+                range: BrickRange::from_word(offer.range),
+                cost: offer.cost,
+            };
+            for (&id, offers) in comparison.borrowers.iter().zip(offers) {
+                visit(id, &offers.into_iter().map(loan).collect::<Vec<_>>());
+            }
+        }
     }
-    Ok(found)
+    Ok(())
 }
 
 /// The borrowers of a batch, and the lenders that they are compared with.
-struct Comparison<'a> {
+struct Comparison {
     batch: usize,
     /// The batches that the lenders are in.
     around: Range<usize>,
-    borrowers: &'a [u32],
+    borrowers: Vec<u32>,
     lenders: Vec<(u32, KeptCodec)>,
 }
 
-impl Comparison<'_> {
+impl Comparison {
     /// What stands for the offers in the cache, and those that are there.
     fn known(&self, encodings: &Encodings, tree: &SequenceTree) -> (Option<Key>, Option<Offers>) {
         let key = self.key(encodings, tree);
@@ -146,10 +158,9 @@ impl Comparison<'_> {
         let keys: Option<Vec<[u8; 32]>> = batches.iter().map(|b| b.base.map(|key| *key.digest())).collect();
         let place = |id: u32| tree.pool.home(id).brick;
         let borrowers: Vec<(u32, u64)> =
-            self.borrowers.iter().map(|&id| (place(id), active(tree, id))).collect();
+            self.borrowers.iter().map(|&id| (place(id), tree.pool.active_hash(id))).collect();
         // Places are told from each other by the batch that they are in.
-        let counts: Vec<usize> =
-            batches.iter().map(|batch| part(&self.lenders, |lender| lender.0, &batch.ids).len()).collect();
+        let counts: Vec<usize> = batches.iter().map(|batch| count(&self.lenders, &batch.ids)).collect();
         let lenders: Vec<(u32, KeptCodec)> =
             self.lenders.iter().map(|&(id, codec)| (place(id), codec)).collect();
         Some(Key::new(&STAGE, &(keys?, self.batch - self.around.start, borrowers, counts, lenders)))
@@ -172,10 +183,10 @@ fn around(batches: &[Batch], batch: usize) -> Range<usize> {
     batch - before..batch + 1 + reach(&mut batches[batch + 1..].iter())
 }
 
-/// The items whose bricks are in a range; they are ascending by brick.
-fn part<'a, T>(items: &'a [T], id: impl Fn(&T) -> u32, ids: &Range<u32>) -> &'a [T] {
-    let at = |end: u32| items.partition_point(|item| id(item) < end);
-    &items[at(ids.start)..at(ids.end)]
+/// How many of some lenders, ascending, are in a range.
+fn count(lenders: &[(u32, KeptCodec)], ids: &Range<u32>) -> usize {
+    let before = |end: u32| lenders.partition_point(|(id, _)| *id < end);
+    before(ids.end) - before(ids.start)
 }
 
 /// The lenders of the batches that are being compared.
@@ -188,45 +199,46 @@ impl Near {
     /// Decodes the lenders of the batches in `around` that were not there for the batch before, and forgets others.
     fn move_to(
         &mut self,
-        encodings: &mut Encodings,
+        encodings: &Encodings,
         around: &Range<usize>,
-        lenders: &[&[(u32, KeptCodec)]],
+        lenders: &impl Fn(&Range<u32>) -> Vec<(u32, KeptCodec)>,
     ) -> io::Result<()> {
         self.batches.retain(|batch, _| around.contains(batch));
         for batch in around.clone() {
             if let Entry::Vacant(place) = self.batches.entry(batch) {
-                place.insert(decoded(encodings, lenders[batch])?);
+                let lenders = lenders(&encodings.batches()[batch].ids);
+                place.insert(decoded(encodings, &lenders)?);
             }
         }
         Ok(())
     }
 }
 
-fn decoded(encodings: &mut Encodings, lenders: &[(u32, KeptCodec)]) -> io::Result<Vec<Lender>> {
-    let mut texels: Vec<Option<(Vec<u8>, u8)>> = vec![None; lenders.len()];
-    for codec in KeptCodec::ALL {
-        let places: Vec<usize> = (0..lenders.len()).filter(|&i| lenders[i].1 == codec).collect();
-        let ids: Vec<u32> = places.iter().map(|&i| lenders[i].0).collect();
-        for (place, kept) in places.into_iter().zip(encodings.texels(&ids, codec)?) {
-            texels[place] = Some(kept);
-        }
+fn decoded(encodings: &Encodings, lenders: &[(u32, KeptCodec)]) -> io::Result<Vec<Lender>> {
+    let mut places: [Vec<u32>; KeptCodec::ALL.len()] = Default::default();
+    let mut tried = Vec::new();
+    for &(id, codec) in lenders {
+        places[codec as usize].push(id);
     }
-    let encodings = &*encodings;
-    let lender = |id: u32, codec: KeptCodec, (bytes, axis): (Vec<u8>, u8)| {
-        let texels = decode(codec.codec(), &bytes, axis, &SequenceRange::default(), BrickRange::SEQUENCE);
+    for codec in KeptCodec::ALL {
+        tried.push(encodings.texels(&places[codec as usize], codec)?);
+    }
+    let lender = |&(id, codec): &(u32, KeptCodec)| {
+        let place = places[codec as usize].binary_search(&id).expect("every lender is of one of the codecs");
+        let (Tried { costs, bytes, axes }, codec) = (&tried[codec as usize], codec.codec());
+        let size = codec.layout().brick_bytes();
+        let (bytes, axis) = (&bytes[place * size..][..size], axes[place]);
+        let texels = decode(codec, bytes, axis, &SequenceRange::default(), BrickRange::SEQUENCE);
         let (mean, energy) = moments(&texels);
         let extent = encodings.ranges[id as usize].extent.to_f64() * f64::from(encodings.sequence.span);
-        let norm = encodings.cost(id, codec).map_or(0.0, |cost| cost.norm);
+        let norm = costs[place].norm;
         // The part of its energy that is its own error is stretched with it.
         let trust = (1.0 - (norm / extent).powi(2) / energy.max(f64::MIN_POSITIVE)).max(0.0).sqrt();
         let mut shape = [0.0; COARSE];
         coarse(&texels, mean, energy, &mut shape);
         Lender { texels, mean, energy, coarse: shape.map(|v| v * trust as f32) }
     };
-    let each = lenders.par_iter().zip(texels);
-    Ok(each
-        .map(|(&(id, codec), kept)| lender(id, codec, kept.expect("every lender is of one of the codecs")))
-        .collect())
+    Ok(lenders.par_iter().map(lender).collect())
 }
 
 /// Mean, and sum of squared differences from it.
@@ -247,16 +259,18 @@ fn coarse(values: &[f32; BRICK_VOXELS], mean: f64, energy: f64, out: &mut [f32])
     out.iter_mut().for_each(|v| *v = ((f64::from(*v) - 8.0 * mean) * scale) as f32);
 }
 
-impl Comparison<'_> {
-    /// For each borrower, whose bricks these are, the closest of the lenders.
-    fn nearest(&self, encodings: &Encodings, bricks: &[Brick], near: &Near) -> Offers {
+impl Comparison {
+    /// For each borrower the closest of the lenders.
+    fn nearest(&self, encodings: &Encodings, tree: &SequenceTree, near: &Near) -> io::Result<Offers> {
         let lenders: Vec<&Lender> = near.batches.values().flatten().collect();
         let mut codebook = Array2::<f32>::zeros((lenders.len(), COARSE));
         for (lender, mut row) in lenders.iter().zip(codebook.rows_mut()) {
             row.as_slice_mut().expect("rows are contiguous").copy_from_slice(&lender.coarse);
         }
         let codebook = codebook.t();
-        let offers = |(ids, bricks): (&[u32], &[Brick])| {
+        let offers = |ids: &[u32]| -> io::Result<Offers> {
+            let _span = trace::span("share");
+            let bricks = tree.pool.read(ids)?;
             let mut shapes = Array2::<f32>::zeros((bricks.len(), COARSE));
             for (brick, mut row) in bricks.iter().zip(shapes.rows_mut()) {
                 let (mean, energy) = moments(&brick.values);
@@ -264,7 +278,7 @@ impl Comparison<'_> {
             }
             // The line through a shape leaves 1 - s² of a brick's energy: the most similar leaves the least.
             let similar = shapes.dot(&codebook);
-            let each = ids.iter().zip(bricks).zip(similar.rows());
+            let each = ids.iter().zip(&bricks).zip(similar.rows());
             let offers = each.map(|((&id, brick), similar)| {
                 let offer = |j: usize| {
                     let (range, cost) = borrow(encodings, brick, lenders.get(j)?)?;
@@ -275,9 +289,10 @@ impl Comparison<'_> {
                 offers.sort_by(|a, b| a.cost.norm.total_cmp(&b.cost.norm));
                 offers
             });
-            offers.collect::<Vec<_>>()
+            Ok(offers.collect())
         };
-        self.borrowers.par_chunks(ROWS).zip(bricks.par_chunks(ROWS)).flat_map_iter(offers).collect()
+        let offers: Vec<Offers> = self.borrowers.par_chunks(ROWS).map(offers).collect::<io::Result<_>>()?;
+        Ok(offers.into_iter().flatten().collect())
     }
 }
 

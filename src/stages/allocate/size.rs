@@ -3,8 +3,9 @@
 use std::io;
 
 use super::adaptive::Target;
+use super::choices::RECORD_BITS;
 use super::rung::Rung;
-use super::search::{GridSearch, RECORD_BITS, Switch, first_step, switches};
+use super::search::{GridSearch, Switch, first_step, switches};
 use crate::codec::Codec;
 use crate::pack::tree::NODE_WORDS;
 use crate::settings::FRAME_MARGIN_DB;
@@ -25,10 +26,7 @@ pub(super) fn at_size(
     };
     let (step, alone) = at_size_above(searches, limit, fixed, &floors, advance)?;
     let squares = |searches: &[GridSearch], picks: &[Vec<Rung>]| -> f64 {
-        let of_grid = |(s, picks): (&GridSearch, &Vec<Rung>)| {
-            s.squares(picks) / (s.peak * s.peak).max(f64::MIN_POSITIVE)
-        };
-        searches.iter().zip(picks).map(of_grid).sum()
+        searches.iter().zip(picks).map(|(s, picks)| s.squares(picks)).sum()
     };
     for (search, picks) in searches.iter_mut().zip(&alone) {
         search.find_loans(picks, step, advance)?;
@@ -157,10 +155,10 @@ fn texel_bytes(counts: &[u32; Rung::ALL.len()]) -> u64 {
 /// What empty bricks do without: their records, and nodes of which nothing is left.
 fn saved_bytes(searches: &[GridSearch], picks: &[Vec<Rung>]) -> u64 {
     let of_grid = |(search, picks): (&GridSearch, &Vec<Rung>)| {
-        let empty = picks.iter().zip(&search.records).filter(|(rung, _)| **rung == Rung::Empty);
+        let empty = picks.iter().zip(&search.table.records).filter(|(rung, _)| **rung == Rung::Empty);
         let records: u64 = empty.map(|(_, records)| u64::from(*records) * u64::from(RECORD_BITS / 8)).sum();
         let tree = &*search.tree;
-        let is_empty = |&record: &u32| match tree.records[record as usize].payload {
+        let is_empty = |&record: &u32| match tree.record(record).payload() {
             Payload::Brick(id) => picks[id as usize] == Rung::Empty,
             Payload::Constant(_) => false,
         };

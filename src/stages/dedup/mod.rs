@@ -28,10 +28,10 @@ pub struct SequenceTree {
     pub frames: Vec<FrameTree>,
     /// The distinct L2 nodes.
     pub nodes: Interner<Node>,
-    /// Runs of places in [`SequenceTree::records`], one run a distinct list of children.
+    /// Runs of entries that [`SequenceTree::record`] understands, one run a distinct list of children.
     pub runs: Interner<u32>,
-    /// The distinct L3 records.
-    pub records: Vec<Record>,
+    /// The distinct L3 records of which more is to be said than which brick they are.
+    records: Vec<Record>,
     /// The distinct masks. A mask of signs follows the mask it belongs to.
     pub masks: Interner<Mask512>,
     /// The distinct bricks.
@@ -93,13 +93,35 @@ impl Node {
 /// One distinct 8³ region.
 #[derive(Clone, Copy, Debug)]
 pub struct Record {
-    /// The place of its mask in [`SequenceTree::masks`]; `None` where a voxel is active if its value is
-    /// not the background.
-    pub mask: Option<u32>,
+    mask: u32,
+    /// A value's bits, or a brick.
+    word: u32,
+    is_brick: bool,
     /// What its inactive voxels are.
     pub rule: InactiveRule,
+}
+
+impl Record {
+    const NO_MASK: u32 = u32::MAX;
+
+    fn new(mask: Option<u32>, rule: InactiveRule, payload: Payload) -> Self {
+        let (is_brick, word) = match payload {
+            Payload::Constant(value) => (false, value.to_bits()),
+            Payload::Brick(id) => (true, id),
+        };
+        Self { mask: mask.unwrap_or(Self::NO_MASK), word, is_brick, rule }
+    }
+
+    /// The place of its mask in [`SequenceTree::masks`]; `None` where a voxel is active if its value is
+    /// not the background.
+    pub fn mask(&self) -> Option<u32> {
+        (self.mask != Self::NO_MASK).then_some(self.mask)
+    }
+
     /// What its other voxels are.
-    pub payload: Payload,
+    pub fn payload(&self) -> Payload {
+        if self.is_brick { Payload::Brick(self.word) } else { Payload::Constant(f32::from_bits(self.word)) }
+    }
 }
 
 /// The values of a [`Record`].
@@ -131,27 +153,51 @@ pub enum DedupError {
     },
 }
 
+/// The bit of an entry that is a brick without a mask, all of whose voxels are its texels': most are. The others are
+/// places of records.
+const PLAIN_BRICK: u32 = 1 << 31;
+
 impl SequenceTree {
+    /// The record of an entry of [`SequenceTree::runs`].
+    pub fn record(&self, entry: u32) -> Record {
+        match entry & PLAIN_BRICK {
+            0 => self.records[entry as usize],
+            _ => Record::new(None, InactiveRule::Texel, Payload::Brick(entry & !PLAIN_BRICK)),
+        }
+    }
+
     /// An empty sequence. `fetch` gives the voxels of frames that are added without; it is not needed where all have
     /// theirs.
-    ///
-    /// # Errors
-    /// When no scratch file can be made.
-    pub fn new(fetch: Option<Box<Fetch>>) -> io::Result<Self> {
-        Ok(Self {
+    pub fn new(fetch: Option<Box<Fetch>>) -> Self {
+        Self {
             background: 0.0,
             frames: Vec::new(),
             nodes: Interner::default(),
             runs: Interner::default(),
             records: Vec::new(),
             masks: Interner::default(),
-            pool: BrickPool::new()?,
+            pool: BrickPool::default(),
             brick_ranges: Vec::new(),
             own_bricks: Vec::new(),
             fetch,
             record_of_brick: Vec::new(),
             record_of_constant: HashMap::new(),
-        })
+        }
+    }
+
+    /// Forgets what only [`SequenceTree::add`] needs: there will be no more frames.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be written.
+    pub fn seal(&mut self) -> io::Result<()> {
+        self.record_of_brick = Vec::new();
+        self.record_of_constant = HashMap::new();
+        self.records.shrink_to_fit();
+        self.brick_ranges.shrink_to_fit();
+        self.nodes.seal();
+        self.runs.seal();
+        self.masks.seal();
+        self.pool.seal()
     }
 
     /// Adds the next frame, and where they are at hand its voxels.
@@ -173,7 +219,7 @@ impl SequenceTree {
                         node.children[usize::from(place) >> 6] |= 1 << (place & 63);
                         run.push(match child {
                             Child::Constant(constant) => self.constant_region(constant),
-                            Child::Brick(brick) => self.brick(brick, &outline.bricks[brick as usize]),
+                            Child::Brick(brick) => self.brick(brick, &outline.bricks[brick as usize])?,
                         });
                     }
                     node.run = self.runs.intern(&run).into();
@@ -202,21 +248,26 @@ impl SequenceTree {
 
     /// The same for voxels that were fetched for an outline from elsewhere: they must be those that it tells of.
     fn put_fetched(&mut self, frame: usize, voxels: &[Brick]) -> io::Result<()> {
-        let own = self.own_bricks[frame].clone();
+        let own: Vec<u32> = self.own_bricks[frame].clone().collect();
+        let digests = self.pool.digests(&own)?;
         let pool = &self.pool;
-        let is_told =
-            |id: u32| voxels.get(pool.home(id).brick as usize).is_some_and(|b| pool.is_digest_of(id, b));
-        if !own.into_par_iter().all(is_told) {
+        let is_told = |(&id, digest): (&u32, &[u8; 32])| {
+            voxels.get(pool.home(id).brick as usize).is_some_and(|brick| {
+                let brick = Brick { keeps_mask: pool.keeps_mask(id), ..brick.clone() };
+                BrickPool::digest(&brick) == *digest
+            })
+        };
+        if !own.par_iter().zip(&digests).all(is_told) {
             return Err(Error::Misled("the outline of a frame is not its own".to_owned()).into());
         }
         self.put_voxels(frame, voxels)
     }
 
-    /// Appends some bricks of the pool to `out`. Frames whose voxels are not there are read for it, whole.
+    /// Sees to it that some bricks of the pool can be read. Frames whose voxels are not there are read for it, whole.
     ///
     /// # Errors
-    /// When a frame or the scratch file cannot be read.
-    pub fn read(&mut self, ids: &[u32], out: &mut Vec<Brick>) -> io::Result<()> {
+    /// When a frame cannot be read or the scratch file not be written.
+    pub fn fetch(&mut self, ids: &[u32]) -> io::Result<()> {
         let absent = ids.iter().filter(|&&id| !self.pool.is_there(id)).map(|&id| self.pool.home(id).frame);
         let absent: BTreeSet<u32> = absent.collect();
         let absent: Vec<usize> = absent.into_iter().map(|frame| frame as usize).collect();
@@ -228,7 +279,7 @@ impl SequenceTree {
                 self.put_fetched(frame, &voxels?)?;
             }
         }
-        self.pool.read(ids, out)
+        self.pool.flush()
     }
 
     /// All frames have one background. A frame without any voxels takes on that of the others.
@@ -256,32 +307,37 @@ impl SequenceTree {
         let next = self.records.len() as u32;
         let id = *self.record_of_constant.entry((value.to_bits(), mask, rule)).or_insert(next);
         if id == next {
-            self.records.push(Record { mask, rule, payload: Payload::Constant(value) });
+            self.records.push(Record::new(mask, rule, Payload::Constant(value)));
         }
         id
     }
 
     /// The record of a brick of the frame that is being added.
-    fn brick(&mut self, place: u32, outline: &BrickOutline) -> u32 {
+    fn brick(&mut self, place: u32, outline: &BrickOutline) -> io::Result<u32> {
         let &BrickOutline { ref active, keeps_mask, rule, values, .. } = outline;
         let (range, digest) = match values {
             Values::Constant(value) => {
                 let mask = self.mask(outline);
-                return self.constant_record(value, mask, rule);
+                return Ok(self.constant_record(value, mask, rule));
             }
             Values::Varied(range, digest) => (range, digest),
         };
         let home = Home { frame: self.frames.len() as u32, brick: place };
-        let (id, is_new) = self.pool.insert(&digest, active, keeps_mask, home);
+        let (id, is_new) = self.pool.insert(&digest, active, keeps_mask, home)?;
         if !is_new {
-            return self.record_of_brick[id as usize];
+            return Ok(self.record_of_brick[id as usize]);
         }
         let mask = self.mask(outline);
-        let record = self.records.len() as u32;
-        self.records.push(Record { mask, rule, payload: Payload::Brick(id) });
+        let record = match (mask, rule) {
+            (None, InactiveRule::Texel) => id | PLAIN_BRICK,
+            _ => {
+                self.records.push(Record::new(mask, rule, Payload::Brick(id)));
+                self.records.len() as u32 - 1
+            }
+        };
         self.record_of_brick.push(record);
         self.brick_ranges.push(range);
-        record
+        Ok(record)
     }
 
     fn mask(&mut self, outline: &BrickOutline) -> Option<u32> {
@@ -293,9 +349,13 @@ impl SequenceTree {
 
     /// The inactive rule of each brick of the pool.
     pub fn brick_rules(&self) -> Vec<InactiveRule> {
-        // Records of bricks are made in the order of the pool.
-        let of_brick = self.records.iter().filter(|r| matches!(r.payload, Payload::Brick(_)));
-        of_brick.map(|r| r.rule).collect()
+        let mut rules = vec![InactiveRule::Texel; self.pool.len() as usize];
+        for record in &self.records {
+            if let Payload::Brick(id) = record.payload() {
+                rules[id as usize] = record.rule;
+            }
+        }
+        rules
     }
 
     /// The bricks of the pool that a frame uses, shared ones each time.
@@ -304,8 +364,8 @@ impl SequenceTree {
             CellRef::Node(node) => Some(&self.nodes.items()[*node as usize]),
             CellRef::Constant(_) => None,
         });
-        let records = nodes.flat_map(|node| node.entries(&self.runs)).map(|&r| &self.records[r as usize]);
-        records.filter_map(|record| match record.payload {
+        let records = nodes.flat_map(|node| node.entries(&self.runs)).map(|&entry| self.record(entry));
+        records.filter_map(|record| match record.payload() {
             Payload::Brick(id) => Some(id),
             Payload::Constant(_) => None,
         })
@@ -319,10 +379,10 @@ impl SequenceTree {
         for node in nodes.items() {
             let mut left = Node { children: [0; 64], run: 0 };
             run.clear();
-            for (place, &record) in bits(&node.children).zip(node.entries(&runs)) {
-                if !matches!(self.records[record as usize].payload, Payload::Brick(id) if is_empty(id)) {
+            for (place, &entry) in bits(&node.children).zip(node.entries(&runs)) {
+                if !matches!(self.record(entry).payload(), Payload::Brick(id) if is_empty(id)) {
                     left.children[place >> 6] |= 1 << (place & 63);
-                    run.push(record);
+                    run.push(entry);
                 }
             }
             moved.push((!run.is_empty()).then(|| {

@@ -10,9 +10,8 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
-use xxhash_rust::xxh3::xxh3_64;
 
-use super::{Cost, Encodings, KeptCodec, Kind, Plain, Terms};
+use super::{Cost, Encodings, KeptCodec, Kind, Made, Plain, Terms, Tried};
 use crate::cache::{Cache, Key, Stage};
 use crate::codec::{SequenceRange, encoder_isa};
 use crate::stages::dedup::SequenceTree;
@@ -85,7 +84,7 @@ impl Kind {
     fn size(self) -> usize {
         match self {
             Self::Plain => 0,
-            Self::Texels(codec) => codec.codec().layout().brick_bytes(),
+            Self::Texels(codec) => codec.brick_bytes(),
         }
     }
 
@@ -118,7 +117,7 @@ impl Batch {
         let (mut ids, mut places) = (Vec::new(), Vec::new());
         for id in self.ids.clone() {
             let found = all.places.binary_search(&tree.pool.home(id).brick).ok();
-            if let Some(i) = found.filter(|&i| all.actives[i] == active(tree, id)) {
+            if let Some(i) = found.filter(|&i| all.actives[i] == tree.pool.active_hash(id)) {
                 ids.push(id);
                 places.push(i);
             }
@@ -180,6 +179,15 @@ impl Entry {
             && self.axes.iter().all(|&axis| axis == 2 || (axis < 2 && kind == Kind::Texels(KeptCodec::Bc7)))
     }
 
+    fn into_made(self, kind: Kind) -> Made {
+        match kind {
+            Kind::Plain => Made::Plain(self.plain),
+            Kind::Texels(codec) => {
+                Made::Texels(codec, Tried { costs: self.costs, bytes: self.bytes, axes: self.axes })
+            }
+        }
+    }
+
     fn push_from(&mut self, other: &Self, i: usize, size: usize) {
         self.places.push(other.places[i]);
         self.actives.push(other.actives[i]);
@@ -234,16 +242,11 @@ impl Encodings {
                 .par_iter()
                 .filter_map(|&(batch, kind)| batches[batch].find(tree, &cache, kind))
                 .collect();
-            let of = |kind: Kind| found.iter().filter(move |found| found.kind == kind);
-            self.kept.par_iter_mut().zip(KeptCodec::ALL).try_for_each(|(kept, codec)| {
-                of(Kind::Texels(codec)).try_for_each(|Found { ids, entry, .. }| {
-                    kept.add(ids, &entry.costs, &entry.bytes, &entry.axes)
-                })
-            })?;
-            for Found { ids, entry, .. } in of(Kind::Plain) {
-                self.keep_plain(ids, &entry.plain);
+            for Found { kind, ids, entry } in found {
+                self.keep(&ids, entry.into_made(kind))?;
             }
         }
+        self.flush()?;
         Ok(())
     }
 
@@ -271,27 +274,19 @@ impl Encodings {
         Ok(())
     }
 
-    fn entry(&mut self, tree: &SequenceTree, ids: &[u32], kind: Kind) -> io::Result<Entry> {
+    fn entry(&self, tree: &SequenceTree, ids: &[u32], kind: Kind) -> io::Result<Entry> {
         let mut entry = Entry {
             places: ids.iter().map(|&id| tree.pool.home(id).brick).collect(),
-            actives: ids.iter().map(|&id| active(tree, id)).collect(),
+            actives: ids.iter().map(|&id| tree.pool.active_hash(id)).collect(),
             ..Entry::default()
         };
         match kind {
-            Kind::Plain => entry.plain = ids.iter().filter_map(|&id| self.plain(id).copied()).collect(),
+            Kind::Plain => entry.plain = self.plain(ids)?,
             Kind::Texels(codec) => {
-                entry.costs = ids.iter().filter_map(|&id| self.cost(id, codec)).collect();
-                for (bytes, axis) in self.texels(ids, codec)? {
-                    entry.bytes.extend(bytes);
-                    entry.axes.push(axis);
-                }
+                let Tried { costs, bytes, axes } = self.texels(ids, codec)?;
+                entry = Entry { costs, bytes, axes, ..entry };
             }
         }
         Ok(entry)
     }
-}
-
-/// A hash of a brick's active voxels.
-pub fn active(tree: &SequenceTree, id: u32) -> u64 {
-    xxh3_64(bytemuck::bytes_of(tree.pool.active(id)))
 }

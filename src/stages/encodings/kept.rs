@@ -1,68 +1,92 @@
-//! Texels in a scratch file, their costs in memory.
+//! What was made of bricks: where it lies in memory, the rest in scratch files.
 
-use std::fs::File;
-use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::io;
+
+use bytemuck::{Pod, Zeroable};
 
 use super::Cost;
-use crate::codec::Codec;
+use crate::volume::Scratch;
 
-/// Bytes between two bricks that are read through rather than skipped: a call to the system costs about as much.
-const GAP: u64 = 16 << 10;
-
-/// One codec's texels of the bricks of a pool, each once.
-pub(super) struct KeptTexels {
-    size: u64,
-    file: Option<File>,
-    /// By brick of the pool: its place among the texels that were kept, and what they cost.
-    known: Vec<Option<(u32, Cost)>>,
-    /// In the order in which they were kept.
-    axes: Vec<u8>,
+/// A [`Cost`], and something more of what it is the cost of.
+#[derive(Clone, Copy, Pod, Zeroable)]
+#[repr(C)]
+pub(super) struct Note {
+    norm: f64,
+    active_norm: f64,
+    max: f32,
+    pub word: u32,
 }
 
-impl KeptTexels {
-    pub fn new(codec: Codec) -> Self {
-        Self { size: codec.layout().brick_bytes() as u64, file: None, known: Vec::new(), axes: Vec::new() }
+impl Note {
+    pub fn new(cost: Cost, word: u32) -> Self {
+        Self { norm: cost.norm, active_norm: cost.active_norm, max: cost.max, word }
     }
 
-    pub fn cost(&self, id: u32) -> Option<Cost> {
-        self.known.get(id as usize).copied().flatten().map(|(_, cost)| cost)
+    pub fn cost(&self) -> Cost {
+        Cost { norm: self.norm, active_norm: self.active_norm, max: self.max }
+    }
+}
+
+/// One kind of result for the bricks of a pool, each once: `N` notes a brick, and texels.
+pub(super) struct Kept<const N: usize> {
+    /// By brick of the pool.
+    is_known: Vec<bool>,
+    notes: Scratch,
+    texels: Option<Scratch>,
+}
+
+impl<const N: usize> Kept<N> {
+    /// Nothing yet, of a pool of that many bricks, with that many bytes of texels each.
+    pub fn new(texels: usize) -> Self {
+        let texels = (texels > 0).then(|| Scratch::new(texels));
+        Self { is_known: Vec::new(), notes: Scratch::new(N * size_of::<Note>()), texels }
     }
 
-    /// Keeps what was made of some bricks.
-    pub fn add(&mut self, ids: &[u32], costs: &[Cost], bytes: &[u8], axes: &[u8]) -> io::Result<()> {
-        let file = match &mut self.file {
-            Some(file) => file,
-            none => none.insert(tempfile::tempfile()?),
-        };
-        file.seek(SeekFrom::End(0))?;
-        file.write_all(bytes)?;
-        let last = ids.iter().max().map_or(0, |id| *id as usize + 1);
-        self.known.resize(self.known.len().max(last), None);
-        for ((&id, &cost), place) in ids.iter().zip(costs).zip(self.axes.len() as u32..) {
-            self.known[id as usize] = Some((place, cost));
+    pub fn is_known(&self, id: u32) -> bool {
+        self.is_known.get(id as usize).is_some_and(|&is_known| is_known)
+    }
+
+    /// Keeps what was made of some bricks of a pool of `bricks`.
+    pub fn add(&mut self, bricks: usize, ids: &[u32], notes: &[[Note; N]], texels: &[u8]) -> io::Result<()> {
+        // None are kept of a kind that nobody asks for.
+        self.is_known.resize(bricks, false);
+        ids.iter().for_each(|&id| self.is_known[id as usize] = true);
+        let mut at = 0;
+        for run in ids.chunk_by(|a, b| a + 1 == *b) {
+            let end = at + run.len();
+            self.notes.put(run[0], bytemuck::cast_slice(notes[at..end].as_flattened()))?;
+            if let Some(scratch) = &mut self.texels {
+                let size = scratch.record();
+                scratch.put(run[0], &texels[at * size..end * size])?;
+            }
+            at = end;
         }
-        self.axes.extend(axes);
         Ok(())
     }
 
-    /// The texels of bricks that are known, and their packing axes.
-    pub fn read(&mut self, ids: &[u32]) -> io::Result<Vec<(Vec<u8>, u8)>> {
-        let place = |id: u32| self.known[id as usize].expect("the codec was tried on the brick").0;
-        let places: Vec<u32> = ids.iter().map(|&id| place(id)).collect();
-        let at = |place: u32| u64::from(place) * self.size;
-        let near = |a: &u32, b: &u32| b > a && at(*b) - at(*a) <= self.size + GAP;
-        let mut texels = Vec::with_capacity(ids.len());
-        let mut bytes = Vec::new();
-        for run in places.chunk_by(near) {
-            let (first, last) = (at(run[0]), at(run[run.len() - 1]) + self.size);
-            bytes.resize((last - first) as usize, 0);
-            let file = self.file.as_mut().expect("texels are in the file");
-            file.seek(SeekFrom::Start(first))?;
-            file.read_exact(&mut bytes)?;
-            texels.extend(run.iter().map(|&place| {
-                let from = (u64::from(place) * self.size - first) as usize;
-                (bytes[from..from + self.size as usize].to_vec(), self.axes[place as usize])
-            }));
+    /// Sees to it that what was added can be read.
+    pub fn flush(&mut self) -> io::Result<()> {
+        self.notes.flush()?;
+        self.texels.as_mut().map_or(Ok(()), Scratch::flush)
+    }
+
+    /// The notes of bricks that are known.
+    pub fn notes(&self, ids: &[u32]) -> io::Result<Vec<[Note; N]>> {
+        let mut notes = Vec::with_capacity(ids.len());
+        self.notes.read(ids, |record| {
+            let mut each = [Note::zeroed(); N];
+            bytemuck::cast_slice_mut(&mut each).copy_from_slice(record);
+            notes.push(each);
+        })?;
+        Ok(notes)
+    }
+
+    /// The texels of bricks that are known, one after another.
+    pub fn texels(&self, ids: &[u32]) -> io::Result<Vec<u8>> {
+        let mut texels = Vec::new();
+        if let Some(scratch) = &self.texels {
+            texels.reserve(ids.len() * scratch.record());
+            scratch.read(ids, |record| texels.extend_from_slice(record))?;
         }
         Ok(texels)
     }

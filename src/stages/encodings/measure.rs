@@ -10,6 +10,9 @@ const LANES: usize = 8;
 pub(super) struct Measure<'a> {
     brick: &'a Brick,
     carried: &'a Mask512,
+    /// 1 for voxels that texels give, and for those of them that are active; else 0.
+    counts: [f32; BRICK_VOXELS],
+    active: [f32; BRICK_VOXELS],
     sign_matters: Option<f64>,
 }
 
@@ -17,23 +20,23 @@ impl<'a> Measure<'a> {
     /// `carried` are the voxels that texels give; `sign_matters` says of level sets from what distance on a voxel must
     /// not change sides.
     pub fn new(brick: &'a Brick, carried: &'a Mask512, sign_matters: Option<f64>) -> Self {
-        Self { brick, carried, sign_matters }
+        let counts = |mask: &Mask512| std::array::from_fn(|i| f32::from(u8::from(mask.get(i))));
+        Self { brick, carried, counts: counts(carried), active: counts(&brick.active), sign_matters }
     }
 
     /// What `decoded` costs, and what a GPU that is `spread` off at each voxel may read.
     pub fn of(&self, decoded: &[f32; BRICK_VOXELS], spread: Option<&[f32; BRICK_VOXELS]>) -> Cost {
         let (mut squares, mut active, mut max) = ([0.0f64; LANES], [0.0f64; LANES], [0.0f64; LANES]);
+        let spread = spread.unwrap_or(&[0.0; BRICK_VOXELS]);
         for at in (0..BRICK_VOXELS).step_by(LANES) {
-            let bits = |mask: &Mask512| mask.0[at >> 6] >> (at & 63);
-            let (carried_bits, active_bits) = (bits(self.carried), bits(&self.brick.active));
             for lane in 0..LANES {
                 let i = at + lane;
-                let is_carried = (carried_bits >> lane & 1) as f64;
-                let error = (f64::from(decoded[i]) - f64::from(self.brick.values[i])).abs() * is_carried;
-                let spread = spread.map_or(0.0, |s| f64::from(s[i])) * is_carried;
+                let counts = f64::from(self.counts[i]);
+                let error = (f64::from(decoded[i]) - f64::from(self.brick.values[i])).abs() * counts;
                 squares[lane] += error * error;
-                active[lane] += error * error * (active_bits >> lane & 1) as f64;
-                max[lane] = max[lane].max(error + spread);
+                active[lane] += error * error * f64::from(self.active[i]);
+                let reach = error + f64::from(spread[i]) * counts;
+                max[lane] = if reach > max[lane] { reach } else { max[lane] };
             }
         }
         if let Some(distance) = self.sign_matters {

@@ -9,6 +9,7 @@ use std::io;
 use std::time::{Duration, Instant};
 
 use half::f16;
+use half::slice::HalfFloatSliceExt;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
@@ -16,10 +17,11 @@ use super::dedup::{SequenceTree, carried};
 use crate::codec::{BATCH, BrickRange, Codec, SequenceRange, Texels, decode, encode, spread};
 use crate::interrupt;
 use crate::settings::RangeMode;
+use crate::trace;
 use crate::volume::{BRICK_VOXELS, BRICKS_IN_FLIGHT, Brick, InactiveRule, Mask512};
 use cached::Batches;
-pub use cached::{Batch, GridCache, active};
-use kept::KeptTexels;
+pub use cached::{Batch, GridCache};
+use kept::{Kept, Note};
 use measure::Measure;
 
 /// What one codec does to one brick.
@@ -100,6 +102,23 @@ impl KeptCodec {
             Self::Unorm8 => Codec::Unorm8,
         }
     }
+
+    /// Bytes of a brick's texels.
+    fn brick_bytes(self) -> usize {
+        self.codec().layout().brick_bytes()
+    }
+}
+
+impl Plain {
+    fn to_notes(&self) -> [Note; 3] {
+        let value = self.value.to_bits();
+        [Note::new(self.constant, value), Note::new(self.empty, 0), Note::new(self.f16, 0)]
+    }
+
+    fn from_notes([constant, empty, f16]: [Note; 3]) -> Self {
+        let value = f32::from_bits(constant.word);
+        Self { value, constant: constant.cost(), empty: empty.cost(), f16: f16.cost() }
+    }
 }
 
 /// What the error of a grid's bricks depends on beside the bricks.
@@ -127,8 +146,8 @@ pub struct Encodings {
     pub ranges: Vec<BrickRange>,
     terms: Terms,
     rules: Vec<InactiveRule>,
-    plain: Vec<Option<Plain>>,
-    kept: [KeptTexels; KeptCodec::ALL.len()],
+    plain: Kept<3>,
+    kept: [Kept<1>; KeptCodec::ALL.len()],
     batches: Batches,
     saved: Instant,
 }
@@ -148,8 +167,8 @@ impl Encodings {
         let batches = Batches::new(tree, cache, &sequence, &terms);
         Some(Self {
             rules: tree.brick_rules(),
-            plain: vec![None; ranges.len()],
-            kept: KeptCodec::ALL.map(|codec| KeptTexels::new(codec.codec())),
+            plain: Kept::new(0),
+            kept: KeptCodec::ALL.map(|codec| Kept::new(codec.brick_bytes())),
             batches,
             saved: Instant::now(),
             sequence,
@@ -158,22 +177,34 @@ impl Encodings {
         })
     }
 
-    /// What a brick would be without texels; `None` while it has not been tried.
-    pub fn plain(&self, id: u32) -> Option<&Plain> {
-        self.plain[id as usize].as_ref()
-    }
-
-    /// What a codec does to a brick; `None` while it has not been tried.
-    pub fn cost(&self, id: u32, codec: KeptCodec) -> Option<Cost> {
-        self.kept[codec as usize].cost(id)
-    }
-
-    /// The texels of some bricks in a codec that was tried on all of them, with their packing axes.
+    /// What some bricks, which were tried, would be without texels.
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn texels(&mut self, ids: &[u32], codec: KeptCodec) -> io::Result<Vec<(Vec<u8>, u8)>> {
-        self.kept[codec as usize].read(ids)
+    pub fn plain(&self, ids: &[u32]) -> io::Result<Vec<Plain>> {
+        Ok(self.plain.notes(ids)?.into_iter().map(Plain::from_notes).collect())
+    }
+
+    /// What a codec does to some bricks that it was tried on.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be read back.
+    pub fn costs(&self, ids: &[u32], codec: KeptCodec) -> io::Result<Vec<Cost>> {
+        Ok(self.kept[codec as usize].notes(ids)?.into_iter().map(|[note]| note.cost()).collect())
+    }
+
+    /// What a codec made of some bricks that it was tried on.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be read back.
+    pub fn texels(&self, ids: &[u32], codec: KeptCodec) -> io::Result<Tried> {
+        let kept = &self.kept[codec as usize];
+        let notes = kept.notes(ids)?;
+        Ok(Tried {
+            costs: notes.iter().map(|[note]| note.cost()).collect(),
+            bytes: kept.texels(ids)?,
+            axes: notes.iter().map(|[note]| note.word as u8).collect(),
+        })
     }
 
     /// Whether a brick's texels give all of its voxels.
@@ -194,8 +225,8 @@ impl Encodings {
 
     fn is_known(&self, id: u32, kind: Kind) -> bool {
         match kind {
-            Kind::Plain => self.plain(id).is_some(),
-            Kind::Texels(codec) => self.cost(id, codec).is_some(),
+            Kind::Plain => self.plain.is_known(id),
+            Kind::Texels(codec) => self.kept[codec as usize].is_known(id),
         }
     }
 
@@ -211,7 +242,6 @@ impl Encodings {
         mut advance: impl FnMut(u64),
     ) -> io::Result<()> {
         self.load(tree, ids, kinds)?;
-        let mut bricks = Vec::new();
         for window in ids.chunks(BRICKS_IN_FLIGHT as usize) {
             if interrupt::is_requested() {
                 self.save(tree)?;
@@ -219,23 +249,18 @@ impl Encodings {
             }
             let missing: Vec<u32> =
                 window.iter().copied().filter(|&id| kinds.iter().any(|k| !self.is_known(id, *k))).collect();
-            bricks.clear();
-            tree.read(&missing, &mut bricks)?;
+            tree.fetch(&missing)?;
             let shared: &SequenceTree = tree;
             // A few bricks are shared out evenly.
             let threads = rayon::current_num_threads();
             let batches = missing.len().div_ceil(BATCH).next_multiple_of(threads).max(threads);
             let batch = missing.len().div_ceil(batches).max(LEAST_BATCH);
-            let made: Vec<Vec<Made>> = missing
-                .par_chunks(batch)
-                .zip(bricks.par_chunks(batch))
-                .map(|(ids, bricks)| self.make_batch(shared, ids, bricks, kinds))
-                .collect();
+            let made: Vec<io::Result<Vec<Made>>> =
+                missing.par_chunks(batch).map(|ids| self.make_batch(shared, ids, kinds)).collect();
             for (ids, made) in missing.chunks(batch).zip(made) {
-                for (made, &kind) in made.into_iter().zip(kinds) {
-                    self.keep(ids, kind, made)?;
-                }
+                made?.into_iter().try_for_each(|made| self.keep(ids, made))?;
             }
+            self.flush()?;
             for &kind in kinds {
                 self.batches.mark(&missing, kind);
             }
@@ -247,14 +272,16 @@ impl Encodings {
         Ok(())
     }
 
-    fn make_batch(&self, tree: &SequenceTree, ids: &[u32], bricks: &[Brick], kinds: &[Kind]) -> Vec<Made> {
+    fn make_batch(&self, tree: &SequenceTree, ids: &[u32], kinds: &[Kind]) -> io::Result<Vec<Made>> {
+        let _span = trace::span("encode");
+        let bricks = &tree.pool.read(ids)?;
         let texels: Vec<Texels> = ids.iter().zip(bricks).map(|(&id, b)| self.prepare(tree, id, b)).collect();
         let each = || ids.iter().zip(bricks).zip(&texels);
         let made = |kind: &Kind| match *kind {
             Kind::Plain => Made::Plain(each().map(|((&id, b), t)| self.make_plain(tree, id, b, t)).collect()),
-            Kind::Texels(codec) => Made::Texels(self.make_texels(codec.codec(), bricks, &texels)),
+            Kind::Texels(codec) => Made::Texels(codec, self.make_texels(codec.codec(), bricks, &texels)),
         };
-        kinds.iter().map(made).collect()
+        Ok(kinds.iter().map(made).collect())
     }
 
     fn make_plain(&self, tree: &SequenceTree, id: u32, brick: &Brick, texels: &Texels) -> Plain {
@@ -266,7 +293,12 @@ impl Encodings {
         let measure = Measure::new(brick, &texels.carried, self.terms.sign_matters);
         // Values just past the greatest half would round to it, but the codec refuses them.
         let f16 = match brick.values.iter().all(|v| v.abs() <= f16::MAX.to_f32()) {
-            true => measure.of(&brick.values.map(|v| f16::from_f32(v).to_f32()), None),
+            true => {
+                let (mut halves, mut back) = ([f16::ZERO; BRICK_VOXELS], [0.0; BRICK_VOXELS]);
+                halves.convert_from_f32_slice(&brick.values);
+                halves.convert_to_f32_slice(&mut back);
+                measure.of(&back, None)
+            }
             false => Cost::IMPOSSIBLE,
         };
         // Only where nothing but values says what is active may background stand for them.
@@ -289,33 +321,41 @@ impl Encodings {
         Tried { costs: each.map(cost).collect(), bytes: encoded.bytes, axes: encoded.axes }
     }
 
-    fn keep(&mut self, ids: &[u32], kind: Kind, made: Made) -> io::Result<()> {
-        match (kind, made) {
-            (Kind::Texels(codec), Made::Texels(Tried { costs, bytes, axes })) => {
-                self.kept[codec as usize].add(ids, &costs, &bytes, &axes)
+    fn keep(&mut self, ids: &[u32], made: Made) -> io::Result<()> {
+        match made {
+            Made::Texels(codec, tried) => {
+                let note = |(&cost, &axis)| [Note::new(cost, u32::from(axis))];
+                let notes: Vec<_> = tried.costs.iter().zip(&tried.axes).map(note).collect();
+                self.kept[codec as usize].add(self.ranges.len(), ids, &notes, &tried.bytes)
             }
-            (_, Made::Plain(plain)) => {
-                self.keep_plain(ids, &plain);
-                Ok(())
-            }
-            (Kind::Plain, Made::Texels(_)) => unreachable!("plain bricks have no texels"),
+            Made::Plain(plain) => self.keep_plain(ids, &plain),
         }
     }
 
-    fn keep_plain(&mut self, ids: &[u32], plain: &[Plain]) {
-        ids.iter().zip(plain).for_each(|(&id, plain)| self.plain[id as usize] = Some(*plain));
+    /// Sees to it that what was kept can be read.
+    fn flush(&mut self) -> io::Result<()> {
+        self.plain.flush()?;
+        self.kept.iter_mut().try_for_each(Kept::flush)
+    }
+
+    fn keep_plain(&mut self, ids: &[u32], plain: &[Plain]) -> io::Result<()> {
+        let notes: Vec<_> = plain.iter().map(Plain::to_notes).collect();
+        self.plain.add(self.ranges.len(), ids, &notes, &[])
     }
 }
 
 /// What was made of a batch, in the order of its bricks.
 enum Made {
     Plain(Vec<Plain>),
-    Texels(Tried),
+    Texels(KeptCodec, Tried),
 }
 
-/// A batch that one codec was tried on.
-struct Tried {
-    costs: Vec<Cost>,
-    bytes: Vec<u8>,
-    axes: Vec<u8>,
+/// What a codec made of some bricks.
+pub struct Tried {
+    /// What it does to each.
+    pub costs: Vec<Cost>,
+    /// Their texels, one after another.
+    pub bytes: Vec<u8>,
+    /// Their packing axes.
+    pub axes: Vec<u8>,
 }

@@ -184,7 +184,7 @@ impl TreeWords {
         let mut at = self.record_at;
         for (grid, outcome) in grids.iter().zip(outcomes) {
             for &record in grid.tree.runs.items() {
-                if let Payload::Brick(id) = grid.tree.records[record as usize].payload
+                if let Payload::Brick(id) = grid.tree.record(record).payload()
                     && grid.allocation().codec(id) != Codec::Constant
                 {
                     self.words[at] |= u32::from(outcome.axes[id as usize]) << 3;
@@ -254,8 +254,8 @@ fn frame_roots(
 }
 
 fn l3_record(grid: &GridInput, record: u32, slots: &[u32], first_mask: u32) -> L3Record {
-    let record = &grid.tree.records[record as usize];
-    let (codec, slot, word2) = match record.payload {
+    let record = grid.tree.record(record);
+    let (codec, slot, word2) = match record.payload() {
         Payload::Constant(value) => (Codec::Constant, 0, value.to_bits()),
         Payload::Brick(id) => {
             let word2 = match grid.allocation().codings[id as usize] {
@@ -266,5 +266,5 @@ fn l3_record(grid: &GridInput, record: u32, slots: &[u32], first_mask: u32) -> L
             (grid.allocation().codec(id), slots[id as usize], word2)
         }
     };
-    L3Record { codec, axis: 0, slot, mask: record.mask.map(|m| first_mask + m), rule: record.rule, word2 }
+    L3Record { codec, axis: 0, slot, mask: record.mask().map(|m| first_mask + m), rule: record.rule, word2 }
 }

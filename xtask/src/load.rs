@@ -1,0 +1,112 @@
+//! How fast a pack comes from a file in the page cache to the bytes that a GPU is given.
+
+use std::error::Error;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use rayon::prelude::*;
+use serde_json::json;
+use volpack::pack::Pack;
+use volpack::pipeline::{Job, Silent, VerifyLevel, build};
+use volpack::settings::{Format, Settings};
+use volpack::vdb::VdbFile;
+
+use crate::{peers, scale};
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// The frames of a short sequence
+    #[arg(required = true)]
+    files: Vec<PathBuf>,
+    /// How many times as long the long one is
+    #[arg(long, default_value_t = 10)]
+    repeats: usize,
+    /// How often each load is timed; the median counts
+    #[arg(long, default_value_t = 25)]
+    rounds: usize,
+    /// Write the raw figures here too
+    #[arg(long)]
+    json: Option<PathBuf>,
+}
+
+pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
+    let folder = tempfile::tempdir()?;
+    let files = volpack::manifest::expand(&args.files)?;
+    let long = scale::repeated(&files, args.repeats, folder.path())?;
+    let short = &long[..files.len()];
+    let mut rows = Vec::new();
+    println!(
+        "{} and {} frames, {} threads, medians\n",
+        short.len(),
+        long.len(),
+        rayon::current_num_threads()
+    );
+    println!(
+        "| format | frames | file MB | GPU MB | whole pack ms | GB/s of GPU bytes | open ms | one frame more ms | its .vdb ms |"
+    );
+    println!("|---|---|---|---|---|---|---|---|---|");
+    for format in [Format::Adaptive, Format::Bc7, Format::Unorm8, Format::F16] {
+        for frames in [short, &long[..]] {
+            let path = folder.path().join("bench.volpack");
+            let settings = Settings { format, ..Settings::default() };
+            build(&Job::new(frames.to_vec(), path.clone(), settings, VerifyLevel::None), &mut Silent)?;
+            let pack = Pack::open(&path)?;
+            let (file_bytes, gpu_bytes) = (pack.file_bytes() as f64, pack.gpu_bytes() as f64);
+            // The densest frame.
+            let leaves = |frame: &usize| pack.grids[0].frames[*frame].record.leaves;
+            let frame = (0..frames.len()).max_by_key(leaves).ok_or("no frames")?;
+            let (mut whole, mut open, mut one, mut vdb) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+            for _ in 0..args.rounds {
+                whole.push(timed(|| load(&path))?);
+                open.push(timed(|| Ok(drop(Pack::open(&path)?)))?);
+                // A fresh pack: what was checked before is not checked again.
+                let fresh = Pack::open(&path)?;
+                one.push(timed(|| Ok(drop(fresh.frame(0, frame)?)))?);
+                vdb.push(timed(|| read(&frames[frame]))?);
+            }
+            let ms = |seconds: &[f64]| median(seconds) * 1e3;
+            println!(
+                "| {} | {} | {:.2} | {:.2} | {:.2} | {:.2} | {:.2} | {:.2} | {:.2} |",
+                format.name(),
+                frames.len(),
+                file_bytes / 1e6,
+                gpu_bytes / 1e6,
+                ms(&whole),
+                gpu_bytes / 1e9 / median(&whole),
+                ms(&open),
+                ms(&one),
+                ms(&vdb),
+            );
+            rows.push(json!({ "format": format, "frames": frames.len(), "file_bytes": file_bytes,
+                "gpu_bytes": gpu_bytes, "whole": whole, "open": open, "frame": one, "vdb": vdb }));
+        }
+    }
+    peers::write(args.json.as_deref(), &json!({ "threads": rayon::current_num_threads(), "rows": rows }))
+}
+
+/// Everything that a GPU is given: the tree and each slab of each atlas, checked and unpacked.
+fn load(path: &Path) -> Result<(), Box<dyn Error>> {
+    let pack = Pack::open(path)?;
+    let slabs: Vec<_> = pack.atlases.iter().flat_map(|a| (0..a.slabs).map(|slab| (a.codec, slab))).collect();
+    slabs.into_par_iter().try_for_each(|(codec, slab)| pack.slab(codec, slab).map(drop))?;
+    Ok(())
+}
+
+fn read(path: &Path) -> Result<(), Box<dyn Error>> {
+    let file = VdbFile::open(path)?;
+    let grid = file.grids.first().ok_or("no grid")?;
+    file.read_tree::<f32>(grid)?;
+    Ok(())
+}
+
+fn timed(work: impl FnOnce() -> Result<(), Box<dyn Error>>) -> Result<f64, Box<dyn Error>> {
+    let start = Instant::now();
+    work()?;
+    Ok(start.elapsed().as_secs_f64())
+}
+
+fn median(seconds: &[f64]) -> f64 {
+    let mut sorted = seconds.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    sorted[sorted.len() / 2]
+}

@@ -1,0 +1,96 @@
+//! Time and memory of a long sequence beside those of a short one.
+
+use std::error::Error;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use serde_json::json;
+
+use crate::measured::{self, median};
+use crate::peers;
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// The frames of a short sequence
+    #[arg(required = true)]
+    files: Vec<PathBuf>,
+    /// How many times as long the long one is
+    #[arg(long, default_value_t = 10)]
+    repeats: usize,
+    /// How often each build is measured, in turns; the median counts
+    #[arg(long, default_value_t = 5)]
+    rounds: usize,
+    /// The volpack to run
+    #[arg(long, default_value = "target/release/volpack")]
+    volpack: PathBuf,
+    /// Write the raw figures here too
+    #[arg(long)]
+    json: Option<PathBuf>,
+}
+
+const CASES: [&[&str]; 4] =
+    [&["--format", "adaptive"], &["--format", "bc7"], &["--format", "unorm8"], &["--format", "f16"]];
+
+/// What a long sequence may take of what a short one does.
+const MOST_MEMORY: f64 = 1.3;
+const MOST_TIME: f64 = 1.1;
+/// What cores may not fall below.
+const LEAST_USE: f64 = 0.85;
+
+pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
+    let folder = tempfile::tempdir()?;
+    let files = volpack::manifest::expand(&args.files)?;
+    let long = repeated(&files, args.repeats, folder.path())?;
+    let short = &long[..files.len()];
+    let cores = std::thread::available_parallelism()?.get() as f64;
+    let output = folder.path().join("bench.volpack");
+    let mut rows = Vec::new();
+    println!("{} and {} frames, {cores} cores\n", short.len(), long.len());
+    println!(
+        "| build | short s | long s | ratio / {} | short MiB | long MiB | ratio | long: cores in use |",
+        args.repeats
+    );
+    println!("|---|---|---|---|---|---|---|---|");
+    for options in CASES {
+        let (mut shorts, mut longs) = (Vec::new(), Vec::new());
+        for _ in 0..args.rounds {
+            shorts.push(measured::run(&mut measured::build(&args.volpack, options, short, &output))?);
+            longs.push(measured::run(&mut measured::build(&args.volpack, options, &long, &output))?);
+        }
+        let of = |figure: fn(&measured::Run) -> f64| (median(&shorts, figure), median(&longs, figure));
+        let (short_s, long_s) = of(|run| run.seconds);
+        let (short_mib, long_mib) = of(|run| run.peak_mib);
+        let usage = median(&longs, |run| run.cpu_seconds / run.seconds) / cores;
+        let verdict = |met: bool| if met { "met" } else { "**missed**" };
+        let (time, memory) = (long_s / short_s / args.repeats as f64, long_mib / short_mib);
+        println!(
+            "| {} | {short_s:.3} | {long_s:.3} | {time:.2} ({}) | {short_mib:.1} | {long_mib:.1} | {memory:.2} ({}) | {:.0} % ({}) |",
+            options[1],
+            verdict(time <= MOST_TIME),
+            verdict(memory <= MOST_MEMORY),
+            usage * 100.0,
+            verdict(usage >= LEAST_USE),
+        );
+        rows.push(json!({ "build": options, "short": shorts, "long": longs }));
+    }
+    peers::write(
+        args.json.as_deref(),
+        &json!({ "frames": [short.len(), long.len()], "cores": cores, "rows": rows }),
+    )
+}
+
+/// The files of a sequence that is `repeats` times as long: each repeat is moved and scaled so that nothing in it is
+/// in another.
+///
+/// # Errors
+/// When OpenVDB is not installed.
+pub fn repeated(files: &[PathBuf], repeats: usize, folder: &Path) -> Result<Vec<PathBuf>, Box<dyn Error>> {
+    let program = peers::compile_openvdb("benches/peers/repeat_openvdb.cpp")?;
+    let frames = folder.join("frames");
+    std::fs::create_dir(&frames)?;
+    let status = Command::new(program).arg(&frames).arg(repeats.to_string()).args(files).status()?;
+    if !status.success() {
+        return Err("the long sequence could not be made".into());
+    }
+    Ok(volpack::manifest::expand(&[frames.join("*.vdb")])?)
+}
