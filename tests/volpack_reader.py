@@ -67,7 +67,7 @@ class Pack:
         self.data = data = pathlib.Path(path).read_bytes()
         magic, major, _, sections, chunks, _, size, digest = struct.unpack_from("<8sHHIIIQ32s", data.ljust(64))
         table, end = 64 + 80 * sections, 64 + 80 * sections + 48 * chunks
-        check(magic == b"\x89VOLPK\r\n" and major == 0 and end <= size == len(data), "no .volpack file, or not whole")
+        check(magic == b"\x89VOLPK\r\n" and major == 1 and end <= size == len(data), "no .volpack file, or not whole")
         check(not blake3 or blake3.blake3(data[:32] + bytes(32) + data[64:end]).digest() == digest, "header digest")
         self.chunks, self.encodings, own = list(struct.iter_unpack("<QII32s", data[table:end])), [], {}
         for kind, tag, encoding, _, first, count in struct.iter_unpack("<6I56x", data[64:table]):

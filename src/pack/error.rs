@@ -10,7 +10,8 @@ pub enum PackError {
     #[error("not a volpack: it does not begin with the format's magic number")]
     NotPack,
     /// A newer format.
-    #[error("pack format version {0}, this volpack reads up to {max}: use a newer volpack", max = super::layout::VERSION)]
+    #[error("pack format version {0}, this volpack reads version {known}: {advice}", known = super::layout::VERSION,
+        advice = if *.0 > super::layout::VERSION { "use a newer volpack" } else { "build the pack again" })]
     Version(u16),
     /// The file is shorter or longer than it says.
     #[error("the file has {have} bytes, its header says {says}: it was cut off or overwritten")]

@@ -7,8 +7,8 @@ compile_error!("packs are little-endian and are read in place");
 
 /// The first eight bytes: a byte that is not text, the name, and a line end that text modes break.
 pub const MAGIC: [u8; 8] = *b"\x89VOLPK\r\n";
-/// The format's version. 0 until scale and speed are measured.
-pub const VERSION: u16 = 0;
+/// The format's version, frozen on 2026-11-22: what it says stays so (`tests/format_v1.rs`). Additions raise `minor`.
+pub const VERSION: u16 = 1;
 /// Sections begin at a multiple of this, which suits every copy from a mapped file to a GPU.
 pub const ALIGNMENT: u64 = 256;
 /// Raw bytes of a chunk in a section that has no slabs.
@@ -20,7 +20,7 @@ pub const CHUNK_BYTES: u32 = 256 << 10;
 pub struct Header {
     /// [`MAGIC`].
     pub magic: [u8; 8],
-    /// [`VERSION`]. A reader refuses a greater one.
+    /// [`VERSION`]. A reader refuses any other.
     pub major: u16,
     /// Additions that an older reader may ignore.
     pub minor: u16,

@@ -27,7 +27,7 @@ pub(super) fn read_tables(bytes: &[u8]) -> Result<(Vec<Section>, Vec<Chunk>), Pa
     let header_bytes = bytes.get(..size_of::<Header>());
     let cut = || PackError::Corrupt("the file ends inside its tables".to_owned());
     bytemuck::bytes_of_mut(&mut header).copy_from_slice(header_bytes.ok_or_else(cut)?);
-    if header.major > VERSION {
+    if header.major != VERSION {
         return Err(PackError::Version(header.major));
     }
     let have = bytes.len() as u64;

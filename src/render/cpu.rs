@@ -168,6 +168,10 @@ impl<F: Real> Tracer<'_, F> {
         Coord(std::array::from_fn(|a| cell[a] + self.setup.base[a]))
     }
 
+    fn skips(&self) -> bool {
+        self.scene.traversal == Traversal::Hdda
+    }
+
     /// The node to step over (the whole of it for HDDA where it has one value, else one cell), whether
     /// it has one value, and the value of the cell's voxel.
     fn node(&self, cell: [i32; 3]) -> (Box3, bool, f32) {
@@ -177,13 +181,11 @@ impl<F: Real> Tracer<'_, F> {
             Content::Constant(constant) => (true, constant.value),
             Content::Brick(values, _) => (false, values[voxel.child_index(3, 1)]),
         };
-        match (constant, self.scene.traversal) {
-            (true, Traversal::Hdda) => {
-                let min = std::array::from_fn(|a| found.origin.0[a] - self.setup.base[a]);
-                (Box3::cube(min, found.dim), constant, value)
-            }
-            _ => (Box3::cube(cell, 1), constant, value),
+        if constant && self.skips() {
+            let min = std::array::from_fn(|a| found.origin.0[a] - self.setup.base[a]);
+            return (Box3::cube(min, found.dim), constant, value);
         }
+        (Box3::cube(cell, 1), constant, value)
     }
 
     /// The integral of density over distance.
@@ -230,7 +232,7 @@ impl<F: Real> Tracer<'_, F> {
     }
 
     /// The first zero of the interpolated field. A cell reaches over to the next voxel on each axis, so
-    /// the last layer of a node's cells is taken one by one.
+    /// the last layer of a node's cells is taken one by one, unless all around is background too.
     fn first_surface(
         &self,
         ray: &Ray<F>,
@@ -242,7 +244,8 @@ impl<F: Real> Tracer<'_, F> {
         while bounds.contains(walk.cell) && *steps < MAX_STEPS {
             *steps += 1;
             let (node, constant, value) = self.node(walk.cell);
-            let inner = Box3 { min: node.min, max: node.max.map(|v| v - 1) };
+            let alone = constant && self.skips() && self.field.is_alone(self.voxel(walk.cell));
+            let inner = Box3 { min: node.min, max: node.max.map(|v| v - i32::from(!alone)) };
             if constant && inner.contains(walk.cell) {
                 let sign = value < 0.0;
                 if negative.is_some_and(|n| n != sign) {

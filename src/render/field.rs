@@ -166,6 +166,20 @@ impl Field {
         }
     }
 
+    /// Whether the region of a voxel and the seven next to it on its high sides are background, all of
+    /// them in one L2 node: then no cell of that region has a corner that is not.
+    pub fn is_alone(&self, at: Coord) -> bool {
+        let region = |axis: usize| at.0[axis].rem_euclid(CELL_DIM) / BRICK_DIM;
+        let Some(Cell::Node(places, _)) = self.cells.get(&at.align_down(CELL_DIM)) else { return false };
+        let last = CELL_DIM / BRICK_DIM - 1;
+        (0..3).all(|axis| region(axis) < last)
+            && (0..8).all(|corner| {
+                let side = |axis: usize| BRICK_DIM * (corner >> axis & 1);
+                let next = at.offset_by([side(0), side(1), side(2)]);
+                places[next.child_index(4, BRICK_DIM)] == 0
+            })
+    }
+
     /// One voxel's value.
     pub fn value(&self, at: Coord) -> f32 {
         match self.find(at).content {

@@ -1,19 +1,24 @@
 //! The wgpu tracer: a pack's sections uploaded as they lie in the file, and `shaders/` run on them.
 
+mod params;
+mod pipelines;
+
 use std::sync::OnceLock;
 
-use bytemuck::{Pod, Zeroable};
+use bytemuck::Pod;
 use wgpu::util::DeviceExt;
 
-use super::cpu::{AMBIENT, Scene, Setup};
+use self::params::Params;
+use self::pipelines::{Has, Pipelines, WORKGROUP};
+use super::cpu::Scene;
 use super::image::Image;
-use super::{Mode, Traversal};
 use crate::codec::Codec;
 use crate::pack::{Atlas, Pack, PackError};
 use crate::volume::CoordBox;
 
-/// `volpack.wgsl`, what an engine takes over.
-pub const VOLPACK_WGSL: &str = include_str!("shaders/volpack.wgsl");
+/// `volpack.wgsl` and `hdda.wgsl`, what an engine takes over.
+pub const VOLPACK_WGSL: &str =
+    concat!(include_str!("shaders/volpack.wgsl"), "\n", include_str!("shaders/hdda.wgsl"));
 /// `tracer.wgsl`, which goes with it.
 pub const TRACER_WGSL: &str = include_str!("shaders/tracer.wgsl");
 
@@ -48,7 +53,7 @@ pub struct Gpu {
     pub name: String,
     device: wgpu::Device,
     queue: wgpu::Queue,
-    pipeline: wgpu::ComputePipeline,
+    pipelines: Pipelines,
     timestamps: bool,
 }
 
@@ -56,35 +61,7 @@ pub struct Gpu {
 pub struct Uploaded {
     tree: wgpu::Buffer,
     textures: [wgpu::TextureView; 5],
-}
-
-#[derive(Clone, Copy, Pod, Zeroable)]
-#[repr(C)]
-struct Params {
-    origin: [f32; 3],
-    mode: u32,
-    forward: [f32; 3],
-    traversal: u32,
-    right: [f32; 3],
-    half_width: f32,
-    up: [f32; 3],
-    half_height: f32,
-    base: [i32; 3],
-    grid: u32,
-    low: [i32; 3],
-    frame: u32,
-    high: [i32; 3],
-    level_set: u32,
-    sun: [f32; 3],
-    extinction: f32,
-    sun_world: [f32; 3],
-    threshold: f32,
-    normal_x: [f32; 3],
-    width: u32,
-    normal_y: [f32; 3],
-    height: u32,
-    normal_z: [f32; 3],
-    ambient: f32,
+    has: Has,
 }
 
 impl Gpu {
@@ -127,46 +104,8 @@ impl Gpu {
             ..Default::default()
         }))
         .map_err(|e| GpuError::Failed(e.to_string()))?;
-        let module = device.create_shader_module(wgpu::ShaderModuleDescriptor {
-            label: Some("volpack + tracer"),
-            source: wgpu::ShaderSource::Wgsl(format!("{VOLPACK_WGSL}\n{TRACER_WGSL}").into()),
-        });
-        let pipeline = device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
-            label: Some("tracer"),
-            layout: Some(&Self::layout(&device)),
-            module: &module,
-            entry_point: Some("main"),
-            compilation_options: wgpu::PipelineCompilationOptions::default(),
-            cache: None,
-        });
-        Ok(Self { name: info.name, device, queue, pipeline, timestamps })
-    }
-
-    fn layout(device: &wgpu::Device) -> wgpu::PipelineLayout {
-        let entry = |binding, ty| wgpu::BindGroupLayoutEntry {
-            binding,
-            visibility: wgpu::ShaderStages::COMPUTE,
-            ty,
-            count: None,
-        };
-        let buffer = |ty| wgpu::BindingType::Buffer { ty, has_dynamic_offset: false, min_binding_size: None };
-        let texture = wgpu::BindingType::Texture {
-            sample_type: wgpu::TextureSampleType::Float { filterable: false },
-            view_dimension: wgpu::TextureViewDimension::D3,
-            multisampled: false,
-        };
-        let mut entries = vec![
-            entry(0, buffer(wgpu::BufferBindingType::Uniform)),
-            entry(1, buffer(wgpu::BufferBindingType::Storage { read_only: true })),
-            entry(2, buffer(wgpu::BufferBindingType::Storage { read_only: false })),
-        ];
-        entries.extend((3..8).map(|binding| entry(binding, texture)));
-        let group = device
-            .create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: None, entries: &entries });
-        device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
-            bind_group_layouts: &[Some(&group)],
-            ..Default::default()
-        })
+        let pipelines = Pipelines::new(&device);
+        Ok(Self { name: info.name, device, queue, pipelines, timestamps })
     }
 
     /// Uploads a pack's tree and texture pages.
@@ -210,7 +149,7 @@ impl Gpu {
             });
         }
         let textures = views.try_into().expect("five codecs have texels");
-        Ok(Uploaded { tree, textures })
+        Ok(Uploaded { tree, textures, has: Has::of(pack) })
     }
 
     fn texture(&self, format: wgpu::TextureFormat, size: [u32; 3]) -> wgpu::Texture {
@@ -287,7 +226,9 @@ impl Gpu {
         }
         let params = self.device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
             label: Some("params"),
-            contents: bytemuck::bytes_of(&params(scene, grid, frame, voxels).ok_or(GpuError::Transform)?),
+            contents: bytemuck::bytes_of(
+                &Params::new(scene, [grid, frame], voxels).ok_or(GpuError::Transform)?,
+            ),
             usage: wgpu::BufferUsages::UNIFORM,
         });
         let buffer = |size, usage| {
@@ -301,9 +242,10 @@ impl Gpu {
         let output = buffer(bytes, wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC);
         let readback = buffer(bytes, wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST);
         let group = self.bind(uploaded, &params, &output);
+        let pipeline = self.pipelines.get(&self.device, uploaded.has, scene);
 
         let mut milliseconds = Vec::new();
-        for _ in 0..repeats {
+        for repeat in 0..repeats {
             let mut encoder = self.device.create_command_encoder(&Default::default());
             let queries = self.timestamps.then(|| Queries::new(&self.device));
             {
@@ -315,15 +257,18 @@ impl Gpu {
                         end_of_pass_write_index: Some(1),
                     }),
                 });
-                pass.set_pipeline(&self.pipeline);
+                pass.set_pipeline(&pipeline);
                 pass.set_bind_group(0, &group, &[]);
-                pass.dispatch_workgroups(width.div_ceil(8), height.div_ceil(8), 1);
+                let [across, down] = WORKGROUP;
+                pass.dispatch_workgroups(width.div_ceil(across), height.div_ceil(down), 1);
             }
             if let Some(q) = &queries {
                 encoder.resolve_query_set(&q.set, 0..2, &q.resolved, 0);
                 encoder.copy_buffer_to_buffer(&q.resolved, 0, &q.readback, 0, 16);
             }
-            encoder.copy_buffer_to_buffer(&output, 0, &readback, 0, bytes);
+            if repeat + 1 == repeats {
+                encoder.copy_buffer_to_buffer(&output, 0, &readback, 0, bytes);
+            }
             self.queue.submit([encoder.finish()]);
             if let Some(q) = &queries {
                 let ticks: Vec<u64> = self.read(&q.readback)?;
@@ -345,7 +290,7 @@ impl Gpu {
             .collect();
         self.device.create_bind_group(&wgpu::BindGroupDescriptor {
             label: None,
-            layout: &self.pipeline.get_bind_group_layout(0),
+            layout: self.pipelines.bindings(),
             entries: &entries,
         })
     }
@@ -411,41 +356,3 @@ fn page_size(atlas: &Atlas) -> [u32; 3] {
     let slabs = atlas.slabs.min(atlas.page_slabs);
     [atlas.columns * 8, atlas.rows * 8, slabs * atlas.codec.layout().slices as u32]
 }
-
-fn params(scene: &Scene, grid: u32, frame: u32, voxels: CoordBox) -> Option<Params> {
-    let setup = Setup::new(scene, voxels)?;
-    let f = |v: [f64; 3]| v.map(|v| v as f32);
-    Some(Params {
-        origin: f(setup.lens.origin),
-        mode: scene.mode as u32,
-        forward: f(setup.lens.forward),
-        traversal: u32::from(scene.traversal == Traversal::Hdda),
-        right: f(setup.lens.right),
-        half_width: setup.lens.half_width as f32,
-        up: f(setup.lens.up),
-        half_height: setup.lens.half_height as f32,
-        base: setup.base,
-        grid,
-        low: setup.bounds.min,
-        frame,
-        high: setup.bounds.max,
-        level_set: u32::from(scene.level_set),
-        sun: f(setup.sun),
-        extinction: scene.extinction as f32,
-        sun_world: f(setup.sun_world),
-        threshold: scene.threshold,
-        normal_x: f(setup.normals[0]),
-        width: scene.size[0],
-        normal_y: f(setup.normals[1]),
-        height: scene.size[1],
-        normal_z: f(setup.normals[2]),
-        ambient: AMBIENT as f32,
-    })
-}
-
-const _: () = {
-    assert!(size_of::<Params>() == 13 * 16 - 16);
-    assert!(Mode::Density as u32 == 0 && Mode::Depth as u32 == 1 && Mode::First as u32 == 2);
-    assert!(Mode::Bricks as u32 == 3 && Mode::Steps as u32 == 4 && Mode::Nodes as u32 == 5);
-    assert!(Mode::Normals as u32 == 6 && Mode::Lit as u32 == 7);
-};

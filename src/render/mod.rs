@@ -17,7 +17,7 @@ mod renderer;
 mod surface;
 mod traverse;
 
-pub use camera::{Camera, CameraError, View};
+pub use camera::{Camera, CameraError, Lens, View};
 pub use cpu::{Scene, trace};
 pub use field::Field;
 pub use image::{Difference, Image, difference, write_apng, write_png};

@@ -43,3 +43,24 @@ pub fn compile_openvdb(source: &str) -> Result<PathBuf, Box<dyn Error>> {
 pub fn write(path: Option<&Path>, figures: &serde_json::Value) -> Result<(), Box<dyn Error>> {
     path.map_or(Ok(()), |path| Ok(std::fs::write(path, serde_json::to_string(figures)?)?))
 }
+
+/// Compiles `benches/peers/nanovdb_trace.cu` for the GPU that is there, into `target/peers`.
+///
+/// # Errors
+/// When there is no CUDA compiler or no NanoVDB: the message says what to install.
+pub fn compile_nanovdb() -> Result<PathBuf, Box<dyn Error>> {
+    let folder = root().join("target/peers");
+    std::fs::create_dir_all(&folder)?;
+    let program = folder.join("nanovdb_trace");
+    let status = Command::new("nvcc")
+        .args(["-O3", "-std=c++17", "-arch=native"])
+        .arg(root().join("benches/peers/nanovdb_trace.cu"))
+        .arg("-o")
+        .arg(&program)
+        .status();
+    match status {
+        Ok(status) if status.success() => Ok(program),
+        _ => Err("nvcc or NanoVDB is not installed: the CUDA toolkit, and apt-get install libnanovdb-dev libnanovdb-tools"
+            .into()),
+    }
+}

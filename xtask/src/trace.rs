@@ -1,14 +1,20 @@
-//! Milliseconds a frame on a GPU, for every format, cell by cell and node by node.
+//! Milliseconds a frame on a GPU: every format, cell by cell and node by node, beside NanoVDB's HDDA on the same
+//! rays.
 
 use std::error::Error;
-use std::path::PathBuf;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 
 use serde_json::json;
 use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::render::gpu::Gpu;
-use volpack::render::{Mode, Scene, Traversal, View};
+use volpack::render::{Image, Lens, Mode, Scene, Traversal, View};
 use volpack::settings::{Format, Settings};
+use volpack::sweep::nanovdb::{self, Quantise};
+
+use crate::peers;
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -21,23 +27,38 @@ pub struct Args {
     /// Pixels, as WIDTH HEIGHT
     #[arg(long, num_args = 2, default_values_t = [1920, 1080])]
     size: Vec<u32>,
+    /// benches/peers/nanovdb_trace.cu, compiled; without it nvcc is asked to
+    #[arg(long)]
+    peer: Option<PathBuf>,
     /// Write the raw figures here too
     #[arg(long)]
     json: Option<PathBuf>,
 }
 
-/// Along (-0.6, -0.35, -0.72) from one diagonal away: the camera of the NanoVDB peer.
+/// Along (-0.6, -0.35, -0.72) from one diagonal away.
 const VIEW: View = View::Orbit([39.8056, 20.4927, 1.0]);
+/// Pictures before those that count, while clocks rise.
+const WARM_UP: u32 = 10;
 
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     let gpu = Gpu::shared()?;
     let folder = tempfile::tempdir()?;
+    let [width, height] = args.size[..] else { return Err("a size is WIDTH HEIGHT".into()) };
+    let size = [width, height];
+    let peer = args.peer.clone().map_or_else(peers::compile_nanovdb, Ok);
+    if let Err(reason) = &peer {
+        println!("NanoVDB is left out: {reason}\n");
+    }
     let mut rows = Vec::new();
-    println!("{} at {} × {}, median of {} frames\n", gpu.name, args.size[0], args.size[1], args.repeats);
-    println!("| volume | shows | format | HDDA ms | DDA ms | DDA / HDDA | HDDA steps | DDA steps |");
-    println!("|---|---|---|---|---|---|---|---|");
+    println!("{} at {width} × {height}, median of {} frames\n", gpu.name, args.repeats);
+    println!(
+        "| volume | shows | format | HDDA ms | NanoVDB ms | HDDA / NanoVDB | apart | DDA ms | DDA / HDDA | HDDA steps | DDA steps |"
+    );
+    println!("|---|---|---|---|---|---|---|---|---|---|---|");
     for path in &args.files {
         let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let mut theirs = None;
+        let mut camera = None;
         for format in Format::ALL {
             let job = Job::new(
                 vec![path.clone()],
@@ -50,25 +71,45 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             let uploaded = gpu.upload(&pack)?;
             let bounds = pack.frame_tree(0, 0).bounds();
             let grid = &pack.grids[0];
+            // Level sets: depth; fog: accumulated density.
+            let level_set = grid.record.class == 1;
+            let (mode, shows) = if level_set { (Mode::Depth, "depth") } else { (Mode::Density, "density") };
+            let scene = Scene::new(grid, &grid.frames[0], bounds, &VIEW, mode, size);
+            // That of the first format for all: lossy packs may have a smaller box.
+            let camera = *camera.get_or_insert(scene.camera);
+            let scene = Scene { camera, ..scene };
+            if let (None, Ok(peer)) = (&theirs, &peer) {
+                theirs = Some(nanovdb_trace(peer, path, &grid.name, &scene, args.repeats, folder.path())?);
+            }
             let mut row = Vec::new();
+            let mut apart = None;
             for traversal in [Traversal::Hdda, Traversal::Dda] {
-                let size = [args.size[0], args.size[1]];
-                // Level sets: depth; fog: accumulated density.
-                let mode = if grid.record.class == 1 { Mode::Depth } else { Mode::Density };
-                let scene =
-                    Scene { traversal, ..Scene::new(grid, &grid.frames[0], bounds, &VIEW, mode, size) };
-                let (image, mut ms) = gpu.trace_timed(&uploaded, [0, 0], bounds, &scene, args.repeats)?;
-                ms.sort_by(f64::total_cmp);
-                row.push((ms.get(ms.len() / 2).copied().unwrap_or(f64::NAN), image.mean_steps()));
+                let scene = Scene { traversal, ..scene };
+                let repeats = args.repeats + WARM_UP;
+                let (image, ms) = gpu.trace_timed(&uploaded, [0, 0], bounds, &scene, repeats)?;
+                apart = apart.or_else(|| theirs.as_ref().map(|t: &Theirs| t.apart(&image, &scene)));
+                let ms = ms.get(WARM_UP as usize..).unwrap_or_default().to_vec();
+                row.push((median(&ms), image.mean_steps()));
                 rows.push(json!({ "volume": name, "format": format, "traversal": format!("{traversal:?}"),
                     "milliseconds": ms, "mean_steps": image.mean_steps() }));
             }
             let [(hdda, hdda_steps), (dda, dda_steps)] = row[..] else { return Err("two traversals".into()) };
-            let shows = if grid.record.class == 1 { "depth" } else { "density" };
+            let beside = match (&theirs, apart) {
+                (Some(t), Some(apart)) => {
+                    let theirs = median(&t.milliseconds);
+                    format!("{theirs:.3} | {:.2} | {apart:.1e}", hdda / theirs)
+                }
+                _ => " | | ".to_owned(),
+            };
             println!(
-                "| {name} | {shows} | {} | {hdda:.3} | {dda:.3} | {:.2} | {hdda_steps:.1} | {dda_steps:.1} |",
+                "| {name} | {shows} | {} | {hdda:.3} | {beside} | {dda:.3} | {:.2} | {hdda_steps:.1} | {dda_steps:.1} |",
                 format.name(),
                 dda / hdda
+            );
+        }
+        if let Some(theirs) = theirs {
+            rows.push(
+                json!({ "volume": name, "format": "NanoVDB float", "milliseconds": theirs.milliseconds }),
             );
         }
     }
@@ -76,4 +117,76 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
         std::fs::write(path, serde_json::to_string(&json!({ "device": gpu.name, "rows": rows }))?)?;
     }
     Ok(())
+}
+
+fn median(milliseconds: &[f64]) -> f64 {
+    let mut sorted = milliseconds.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    sorted.get(sorted.len() / 2).copied().unwrap_or(f64::NAN)
+}
+
+/// What NanoVDB makes of a scene.
+struct Theirs {
+    milliseconds: Vec<f64>,
+    /// World units of a voxel.
+    voxel: f64,
+    /// In voxels: the integral of density, or depth.
+    picture: Vec<f32>,
+}
+
+/// Traces a float grid of `vdb` with the peer's program.
+fn nanovdb_trace(
+    peer: &Path,
+    vdb: &Path,
+    grid: &str,
+    scene: &Scene,
+    repeats: u32,
+    folder: &Path,
+) -> Result<Theirs, Box<dyn Error>> {
+    let (nvdb, out) = (folder.join("peer.nvdb"), folder.join("peer.f32"));
+    nanovdb::convert(vdb, grid, &Quantise::Float, &nvdb)?;
+    // To NanoVDB a voxel is the cube from its coordinate on: half a voxel off from index space.
+    let lens = Lens::new(&scene.camera, &scene.matrix, scene.size, [0.5; 3]).ok_or("no inverse transform")?;
+    let rays = [lens.origin, lens.forward, lens.right, lens.up].concat();
+    let rays: Vec<String> = rays.iter().map(ToString::to_string).collect();
+    let mut child = Command::new(peer)
+        .arg(&nvdb)
+        .arg(if scene.level_set { "level" } else { "fog" })
+        .args(scene.size.map(|s| s.to_string()))
+        .arg((repeats + WARM_UP).to_string())
+        .arg(&out)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()?;
+    child.stdin.take().ok_or("a pipe")?.write_all(rays.join(" ").as_bytes())?;
+    let output = child.wait_with_output()?;
+    if !output.status.success() {
+        return Err(format!("{} failed on {}", peer.display(), vdb.display()).into());
+    }
+    let milliseconds = String::from_utf8(output.stdout)?
+        .lines()
+        .skip(WARM_UP as usize)
+        .map(str::parse)
+        .collect::<Result<_, _>>()?;
+    let [x, y, z] = lens.forward;
+    let picture = std::fs::read(&out)?;
+    let picture = picture.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+    Ok(Theirs { milliseconds, voxel: 1.0 / (x * x + y * y + z * z).sqrt(), picture })
+}
+
+impl Theirs {
+    /// How far the pictures are apart. Fog: the mean difference of opacity. Level sets: the median difference
+    /// in voxels where both hit, since NanoVDB says where the ray enters the voxel behind the zero.
+    fn apart(&self, ours: &Image, scene: &Scene) -> f64 {
+        let pixels =
+            ours.pixels.iter().map(|p| f64::from(p[0])).zip(self.picture.iter().map(|v| f64::from(*v)));
+        if scene.level_set {
+            let both = pixels.filter(|(ours, theirs)| *ours >= 0.0 && *theirs >= 0.0);
+            return median(
+                &both.map(|(ours, theirs)| (ours / self.voxel - theirs).abs()).collect::<Vec<_>>(),
+            );
+        }
+        let opacity = |depth: f64| 1.0 - (-depth * self.voxel * scene.extinction).exp();
+        pixels.map(|(ours, theirs)| (ours - opacity(theirs)).abs()).sum::<f64>() / self.picture.len() as f64
+    }
 }

@@ -2,9 +2,9 @@
 
 struct Params {
     origin: vec3f,          // the eye, in cells from base
-    mode: u32,
+    width: u32,
     forward: vec3f,         // the ray through the middle, then to the right edge and to the top
-    traversal: u32,         // 0 DDA, 1 HDDA
+    height: u32,
     right: vec3f,
     half_width: f32,
     up: vec3f,
@@ -14,18 +14,20 @@ struct Params {
     low: vec3i,             // the cells to trace
     frame: u32,
     high: vec3i,
-    level_set: u32,
-    sun: vec3f,             // towards the sun in cells, scaled to how far off a surface shadows begin
     extinction: f32,
-    sun_world: vec3f,
+    sun: vec3f,             // towards the sun in cells, scaled to how far off a surface shadows begin
     threshold: f32,
-    normal_x: vec3f,        // rows whose products with a gradient are the normal in world space
-    width: u32,
-    normal_y: vec3f,
-    height: u32,
-    normal_z: vec3f,
+    sun_world: vec3f,
     ambient: f32,
+    normal_x: vec3f,        // rows whose products with a gradient are the normal in world space
+    normal_y: vec3f,
+    normal_z: vec3f,
 }
+
+// A pipeline does one thing: what it does not is left out of its code, and costs no registers.
+override MODE: u32 = 0u;
+override HDDA: bool = true;
+override LEVEL_SET: bool = false;
 
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> tree: array<u32>;
@@ -42,13 +44,11 @@ fn vp_word(i: u32) -> u32 {
 
 // One page a codec is bound here; an engine with more chooses by page.
 fn vp_texel(codec: u32, page: u32, p: vec3i) -> vec4f {
-    switch codec {
-        case 1u: { return textureLoad(bc7, p, 0); }
-        case 2u: { return textureLoad(bc4, p, 0); }
-        case 3u: { return textureLoad(unorm8, p, 0); }
-        case 4u: { return textureLoad(f16_, p, 0); }
-        default: { return textureLoad(f32_, p, 0); }
-    }
+    if (VP_CODECS & 2u) != 0u && codec == 1u { return textureLoad(bc7, p, 0); }
+    if (VP_CODECS & 4u) != 0u && codec == 2u { return textureLoad(bc4, p, 0); }
+    if (VP_CODECS & 8u) != 0u && codec == 3u { return textureLoad(unorm8, p, 0); }
+    if (VP_CODECS & 16u) != 0u && codec == 4u { return textureLoad(f16_, p, 0); }
+    return textureLoad(f32_, p, 0);
 }
 
 const DENSITY = 0u;
@@ -60,35 +60,58 @@ const NODES = 5u;
 const NORMALS = 6u;
 const MAX_STEPS = 65536u;
 
-var<private> grid: VpGrid;
 var<private> steps: u32;
 
-// The node to step over: all of it for HDDA where it has one value, else one cell.
-struct Step {
+// The node around a ray's cell, as far as it is traced: from low to high (outside).
+struct Place {
+    cell: VpCell,
     node: VpNode,
     low: vec3i,
     high: vec3i,
 }
 
-fn step_at(cell: vec3i) -> Step {
-    let node = vp_find(grid, params.frame, cell + params.base);
-    if node.constant && params.traversal == 1u {
-        let low = node.min - params.base;
-        return Step(node, low, low + node.dim);
-    }
-    return Step(node, cell, cell + 1);
+fn place_of(g: VpGrid, last: VpCell, cell: vec3i) -> Place {
+    let p = cell + params.base;
+    let l2 = vp_cell(g, params.frame, last, p);
+    let node = vp_find(g, l2, p);
+    let low = node.min - params.base;
+    return Place(l2, node, max(low, params.low), min(low + node.dim, params.high));
+}
+
+fn traced(walk: VpWalk) -> bool {
+    return vp_inside(walk.cell, params.low, params.high) && steps < MAX_STEPS;
 }
 
 fn optical_depth(ray: VpRay) -> f32 {
     var depth = 0.0;
     var walk = vp_enter(ray, params.low, params.high);
-    while vp_inside(walk.cell, params.low, params.high) && steps < MAX_STEPS {
-        steps++;
-        let s = step_at(walk.cell);
-        let value = vp_node_value(grid, s.node, walk.cell + params.base);
-        let start = walk.t;
-        walk = vp_leave(ray, walk, max(s.low, params.low), min(s.high, params.high));
-        depth += (walk.t - start) * value;
+    if !traced(walk) {
+        return depth;
+    }
+    let g = vp_grid(params.grid);
+    var cell = VP_NOWHERE;
+    while traced(walk) {
+        let at = place_of(g, cell, walk.cell);
+        cell = at.cell;
+        if HDDA && at.node.constant {
+            steps++;
+            let start = walk.t;
+            walk = vp_leave(ray, walk, at.low, at.high);
+            depth += (walk.t - start) * at.node.value;
+            continue;
+        }
+        let brick = vp_brick(g, at.node);
+        let behind = vp_behind(ray, at.low, at.high);
+        loop {
+            steps++;
+            let value = vp_value(g, brick, walk.cell + params.base);
+            let start = walk.t;
+            walk = vp_step(ray, walk);
+            depth += (walk.t - start) * value;
+            if any(walk.cell == behind) {
+                break;
+            }
+        }
     }
     return depth;
 }
@@ -104,7 +127,7 @@ struct Hit {
 const MISS = Hit(false, 0.0, vec3i(0), 3, 0.0);
 
 fn first_hit(ray: VpRay) -> Hit {
-    if params.level_set == 1u {
+    if LEVEL_SET {
         return first_surface(ray);
     }
     return first_density(ray);
@@ -112,14 +135,35 @@ fn first_hit(ray: VpRay) -> Hit {
 
 fn first_density(ray: VpRay) -> Hit {
     var walk = vp_enter(ray, params.low, params.high);
-    while vp_inside(walk.cell, params.low, params.high) && steps < MAX_STEPS {
-        steps++;
-        let s = step_at(walk.cell);
-        let value = vp_node_value(grid, s.node, walk.cell + params.base);
-        if value > params.threshold {
-            return Hit(true, walk.t, walk.cell, walk.axis, value);
+    if !traced(walk) {
+        return MISS;
+    }
+    let g = vp_grid(params.grid);
+    var cell = VP_NOWHERE;
+    while traced(walk) {
+        let at = place_of(g, cell, walk.cell);
+        cell = at.cell;
+        if HDDA && at.node.constant {
+            steps++;
+            if at.node.value > params.threshold {
+                return Hit(true, walk.t, walk.cell, walk.axis, at.node.value);
+            }
+            walk = vp_leave(ray, walk, at.low, at.high);
+            continue;
         }
-        walk = vp_leave(ray, walk, max(s.low, params.low), min(s.high, params.high));
+        let brick = vp_brick(g, at.node);
+        let behind = vp_behind(ray, at.low, at.high);
+        loop {
+            steps++;
+            let value = vp_value(g, brick, walk.cell + params.base);
+            if value > params.threshold {
+                return Hit(true, walk.t, walk.cell, walk.axis, value);
+            }
+            walk = vp_step(ray, walk);
+            if any(walk.cell == behind) || steps >= MAX_STEPS {
+                break;
+            }
+        }
     }
     return MISS;
 }
@@ -130,49 +174,99 @@ fn local(ray: VpRay, cell: vec3i, t: f32) -> vec3f {
 }
 
 // The first zero of the interpolated field. A cell reaches over to the next voxel on each axis, so the
-// last layer of a node's cells is taken one by one.
+// last layer of a node's cells is taken one by one, unless all around is background too.
 fn first_surface(ray: VpRay) -> Hit {
     var walk = vp_enter(ray, params.low, params.high);
-    var known = false;
-    var negative = false;
-    while vp_inside(walk.cell, params.low, params.high) && steps < MAX_STEPS {
-        steps++;
-        let s = step_at(walk.cell);
-        if s.node.constant && vp_inside(walk.cell, s.low, s.high - 1) {
-            let sign = s.node.value < 0.0;
-            if known && negative != sign {
-                return Hit(true, walk.t, walk.cell, walk.axis, 1.0);
+    if !traced(walk) {
+        return MISS;
+    }
+    let g = vp_grid(params.grid);
+    var l2 = VP_NOWHERE;
+    var known = false;      // whether a sign has been seen,
+    var negative = false;   // and which
+    while traced(walk) {
+        let at = place_of(g, l2, walk.cell);
+        l2 = at.cell;
+        let skips = HDDA && at.node.constant;
+        let alone = skips && at.node.dim == 8 && vp_alone(l2, walk.cell + params.base);
+        let inner = min(at.high, at.node.min - params.base + at.node.dim - select(1, 0, alone));
+        let behind = vp_behind(ray, at.low, at.high);
+        // Two bits for each part that a cell may have: its sign, or 3 until it is looked up.
+        var signs = 0xfffcu | vp_sign(g, at.node);
+        let brick = vp_brick(g, at.node);
+        loop {
+            steps++;
+            if skips && vp_inside(walk.cell, at.low, inner) {
+                let sign = at.node.value < 0.0;
+                if known && negative != sign {
+                    return Hit(true, walk.t, walk.cell, walk.axis, 1.0);
+                }
+                known = true;
+                negative = sign;
+                walk = vp_leave(ray, walk, at.low, inner);
+                if any(walk.cell == behind) || steps >= MAX_STEPS {
+                    break;
+                }
+                continue;
             }
-            known = true;
-            negative = sign;
-            walk = vp_leave(ray, walk, max(s.low, params.low), min(s.high - 1, params.high));
-            continue;
-        }
-        let corners = vp_corners(grid, params.frame, walk.cell + params.base);
-        let exit = vp_exit(ray, walk.cell, walk.cell + 1);
-        let along = ray.direction * (exit.t - walk.t);
-        let c = cubic(corners, local(ray, walk.cell, walk.t), along);
-        if !known {
-            known = true;
-            negative = c.x < 0.0;
-        }
-        var mixed = false;
-        for (var i = 0; i < 8; i++) {
-            mixed |= (corners[i] < 0.0) != negative;
-        }
-        if mixed {
-            let u = first_change(c, negative);
-            if u >= 0.0 {
-                return Hit(true, walk.t + (exit.t - walk.t) * u, walk.cell, walk.axis, 1.0);
+            // Bit 0 for a corner that is not negative, 1 for one that is, 2 for not known.
+            let p = walk.cell + params.base;
+            let edges = vp_edges(p);
+            var seen = select(0u, 1u << u32(negative), known);
+            var part = 0u;
+            loop {
+                var sign = (signs >> (2u * part)) & 3u;
+                if sign == 3u {
+                    sign = vp_sign(g, vp_part(g, params.frame, l2, p, part));
+                    signs ^= (3u ^ sign) << (2u * part);
+                }
+                if sign == VP_EITHER && part == 0u {
+                    sign = vp_idle(g, brick, p);
+                }
+                seen |= 1u << sign;
+                part = vp_next_part(part, edges);
+                if part == 0u {
+                    break;
+                }
+            }
+            if seen <= 2u {
+                known = true;
+                negative = seen == 2u;
+            } else {
+                let corners = vp_corners(g, params.frame, l2, brick, p);
+                let exit = vp_least(walk.next);
+                let along = ray.direction * (exit - walk.t);
+                let c = cubic(corners, local(ray, walk.cell, walk.t), along);
+                negative = select(c.x < 0.0, negative, known);
+                known = true;
+                if mixed(corners, negative) {
+                    let u = first_change(c, negative);
+                    if u >= 0.0 {
+                        return Hit(true, walk.t + (exit - walk.t) * u, walk.cell, walk.axis, 1.0);
+                    }
+                }
+            }
+            walk = vp_step(ray, walk);
+            if any(walk.cell == behind) || steps >= MAX_STEPS {
+                break;
             }
         }
-        walk = vp_leave(ray, walk, walk.cell, walk.cell + 1);
     }
     return MISS;
 }
 
+// Whether a corner has the other sign.
+fn mixed(corners: VpCorners, negative: bool) -> bool {
+    let other = vec4<bool>(!negative);
+    return any(((corners.near < vec4f(0.0)) == other) | ((corners.far < vec4f(0.0)) == other));
+}
+
 // The interpolant of a cell from a place in it along a ray, as a cubic in 0 to 1.
-fn cubic(v: array<f32, 8>, p: vec3f, d: vec3f) -> vec4f {
+fn cubic(corners: VpCorners, p: vec3f, d: vec3f) -> vec4f {
+    let v = array(
+        corners.near.x, corners.near.y, corners.near.z, corners.near.w,
+        corners.far.x, corners.far.y, corners.far.z, corners.far.w,
+    );
     let k = vec3f(v[1] - v[0], v[2] - v[0], v[4] - v[0]);
     let xy = v[3] - v[1] - v[2] + v[0];
     let yz = v[6] - v[2] - v[4] + v[0];
@@ -234,20 +328,19 @@ fn first_change(c: vec4f, negative: bool) -> f32 {
 
 // A surface's own normal in world space; else that of the face, in cell space.
 fn normal_at(ray: VpRay, hit: Hit) -> vec3f {
-    if params.level_set == 0u {
-        var n = vec3f(0.0);
-        if hit.axis < 3 {
-            n[hit.axis] = select(1.0, -1.0, ray.direction[hit.axis] > 0.0);
-        }
-        return n;
+    if !LEVEL_SET {
+        return select(vec3f(0.0), select(vec3f(1.0), vec3f(-1.0), ray.forward), VP_AXES == vec3i(hit.axis));
     }
-    let c = vp_corners(grid, params.frame, hit.cell + params.base);
+    let g = vp_grid(params.grid);
+    let at = place_of(g, VP_NOWHERE, hit.cell);
+    let c = vp_corners(g, params.frame, at.cell, vp_brick(g, at.node), hit.cell + params.base);
     let p = clamp(local(ray, hit.cell, hit.t), vec3f(0.0), vec3f(1.0));
-    let q = 1.0 - p;
+    let x = mix(vec4f(c.near.xz, c.far.xz), vec4f(c.near.yw, c.far.yw), p.x);
+    let z = mix(c.near, c.far, p.z);
     let gradient = vec3f(
-        q.y * q.z * (c[1] - c[0]) + p.y * q.z * (c[3] - c[2]) + q.y * p.z * (c[5] - c[4]) + p.y * p.z * (c[7] - c[6]),
-        q.x * q.z * (c[2] - c[0]) + p.x * q.z * (c[3] - c[1]) + q.x * p.z * (c[6] - c[4]) + p.x * p.z * (c[7] - c[5]),
-        q.x * q.y * (c[4] - c[0]) + p.x * q.y * (c[5] - c[1]) + q.x * p.y * (c[6] - c[2]) + p.x * p.y * (c[7] - c[3]),
+        mix(z.y - z.x, z.w - z.z, p.y),
+        mix(x.y - x.x, x.w - x.z, p.z),
+        mix(x.z - x.x, x.w - x.y, p.y),
     );
     return normalize(vec3f(dot(params.normal_x, gradient), dot(params.normal_y, gradient), dot(params.normal_z, gradient)));
 }
@@ -293,9 +386,9 @@ fn node_color(ray: VpRay, hit: Hit) -> vec3f {
 
 fn shade(ray: VpRay, hit: Hit) -> vec3f {
     if !hit.found {
-        return vec3f(select(0.0, -1.0, params.mode == DEPTH));
+        return vec3f(select(0.0, -1.0, MODE == DEPTH));
     }
-    switch params.mode {
+    switch MODE {
         case DEPTH: { return vec3f(hit.t); }
         case FIRST: { return vec3f(hit.value); }
         case BRICKS: { return brick_hue(hit.cell + params.base); }
@@ -306,12 +399,11 @@ fn shade(ray: VpRay, hit: Hit) -> vec3f {
     }
 }
 
-@compute @workgroup_size(8, 8)
+@compute @workgroup_size(8, 16)
 fn main(@builtin(global_invocation_id) id: vec3u) {
     if id.x >= params.width || id.y >= params.height {
         return;
     }
-    grid = vp_grid(params.grid);
     steps = 0u;
     let x = f32(2u * id.x + 1u) / f32(params.width) - 1.0;
     let y = 1.0 - f32(2u * id.y + 1u) / f32(params.height);
@@ -320,12 +412,12 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
     let ray = vp_ray(params.origin, ahead / sqrt(1.0 + edge.x * edge.x + edge.y * edge.y));
 
     var color: vec3f;
-    if params.mode == DENSITY && params.level_set == 0u {
+    if MODE == DENSITY && !LEVEL_SET {
         color = vec3f(1.0 - exp(-(optical_depth(ray) * params.extinction)));
     } else {
         color = shade(ray, first_hit(ray));
     }
-    if params.mode == STEPS {
+    if MODE == STEPS {
         color = vec3f(f32(steps));
     }
     output[id.y * params.width + id.x] = vec4f(color, f32(steps));

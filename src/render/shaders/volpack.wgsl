@@ -8,11 +8,15 @@
 // and gets, top to bottom in this file:
 //
 //   vp_grid(grid)                       a grid's header; load it once
-//   vp_find(g, frame, p)                the node around a voxel: how large, constant or not
-//   vp_node_value(g, node, p)           a voxel's value in it
-//   vp_voxel(g, frame, p)               both in one: point fetch
+//   vp_cell(g, frame, last, p)          the 128³ cell around a voxel; keep it for the next lookup
+//   vp_find(g, cell, p)                 the node around a voxel: how large, constant or a brick
+//   vp_brick(g, node)                   how a node's voxels are read; keep it while in the node
+//   vp_value(g, brick, p)               a voxel's value
+//   vp_voxel(g, frame, p)               all of these in one: point fetch
 //   vp_trilinear(g, frame, p)           eight point fetches, interpolated
-//   vp_enter, vp_leave                  the HDDA: a ray's first cell, and the first behind a node
+//   vp_sign, vp_alone, vp_idle          whether a node or a cell can hold a zero, without a texel
+//
+// hdda.wgsl goes with it, for rays.
 //
 // Coordinates are OpenVDB's index coordinates. docs/format.md is the specification of what is read.
 
@@ -21,27 +25,100 @@ const VP_NO_MASK = 0x3fffffffu;
 const VP_BC7 = 1u;
 const VP_F16 = 4u;
 
+// What a host may promise of its packs when it makes a pipeline: code for what does not occur is left
+// out.
+override VP_CODECS: u32 = 63u;      // bit t is on if codec tag t may occur
+override VP_MASKS: bool = true;     // whether records may have masks
+
 struct VpGrid {
+    header: u32,        // word at which its header begins
     origin: vec3i,      // smallest corner of what the L1 nodes cover
-    cells: vec3i,       // 128³ cells of an L1 node
-    roots: vec3i,       // L1 nodes of a frame
     lo: f32,            // what brick ranges are fractions of
     span: f32,
     background: f32,
-    root_at: u32,       // word at which the frames' roots begin
+}
+
+fn vp_vec3i(at: u32) -> vec3i {
+    return bitcast<vec3i>(vec3u(vp_word(at), vp_word(at + 1u), vp_word(at + 2u)));
+}
+
+fn vp_words(at: vec4u) -> vec4u {
+    return vec4u(vp_word(at.x), vp_word(at.y), vp_word(at.z), vp_word(at.w));
 }
 
 fn vp_grid(grid: u32) -> VpGrid {
-    let w = vp_word(2u) + 16u * grid;
+    let at = vp_word(2u) + 16u * grid;
     return VpGrid(
-        vec3i(bitcast<i32>(vp_word(w)), bitcast<i32>(vp_word(w + 1u)), bitcast<i32>(vp_word(w + 2u))),
-        vec3i(i32(vp_word(w + 3u)), i32(vp_word(w + 4u)), i32(vp_word(w + 5u))),
-        vec3i(i32(vp_word(w + 6u)), i32(vp_word(w + 7u)), i32(vp_word(w + 8u))),
-        bitcast<f32>(vp_word(w + 9u)),
-        bitcast<f32>(vp_word(w + 10u)),
-        bitcast<f32>(vp_word(w + 11u)),
-        vp_word(w + 12u),
+        at,
+        vp_vec3i(at),
+        bitcast<f32>(vp_word(at + 9u)),
+        bitcast<f32>(vp_word(at + 10u)),
+        bitcast<f32>(vp_word(at + 11u)),
     );
+}
+
+// How many bits of a mask are on before bit i, or VP_NONE if bit i is off. Behind the mask's words lie
+// the counts before each of them, two to a word.
+fn vp_rank(mask_at: u32, ranks_at: u32, i: u32) -> u32 {
+    let word = i >> 5u;
+    let bits = vp_word(mask_at + word);
+    let before = (vp_word(ranks_at + (word >> 1u)) >> (16u * (word & 1u))) & 0xffffu;
+    let bit = 1u << (i & 31u);
+    return select(before + countOneBits(bits & (bit - 1u)), VP_NONE, (bits & bit) == 0u);
+}
+
+// A 128³ cell. A ray stays in one for many steps, so the way from the root to it is walked once.
+struct VpCell {
+    place: vec3i,       // which one, counted from the grid's origin
+    l2: u32,            // word at which its L2 node begins, or VP_NONE: it is constant
+    records: u32,       // word at which the L2 node's records begin
+    dim: i32,           // side of the constant: 128, or 4096 for all of an L1 node
+    value: f32,         // its value
+}
+
+// What to begin with: a cell that no voxel is in.
+const VP_NOWHERE = VpCell(vec3i(0x7fffffff), VP_NONE, 0u, 128, 0.0);
+
+fn vp_cell(g: VpGrid, frame: u32, last: VpCell, p: vec3i) -> VpCell {
+    let place = (p - g.origin) >> vec3u(7u);
+    if all(place == last.place) {
+        return last;
+    }
+    var cell = VpCell(place, VP_NONE, 0u, 128, g.background);
+    let cells = vp_vec3i(g.header + 3u);
+    let roots = vp_vec3i(g.header + 6u);
+    if any(place < vec3i(0)) || any(place >= cells * roots) {
+        return cell;
+    }
+    // Root: one word a frame and L1 node.
+    let r = place / cells;
+    let root = frame * u32(roots.x * roots.y * roots.z) + u32((r.x * roots.y + r.y) * roots.z + r.z);
+    var link = vp_word(vp_word(g.header + 12u) + root);
+    if link == 0u {
+        return cell;
+    }
+    if (link >> 31u) == 1u {
+        cell.dim = 4096;
+    } else {
+        // L1: mask, ranks, one link a child.
+        let c = place - r * cells;
+        let i = u32((c.x * cells.y + c.y) * cells.z + c.z);
+        let mask_words = u32(cells.x * cells.y * cells.z + 31) >> 5u;
+        let ranks_at = link + mask_words;
+        let child = vp_rank(link, ranks_at, i);
+        if child == VP_NONE {
+            return cell;
+        }
+        link = vp_word(ranks_at + ((mask_words + 1u) >> 1u) + child);
+    }
+    if (link >> 31u) == 1u {
+        cell.value = bitcast<f32>(vp_word(vp_word(9u) + (link & 0x3fffffffu)));
+        return cell;
+    }
+    // L2: mask, ranks, first record.
+    cell.l2 = vp_word(3u) + 193u * link;
+    cell.records = vp_word(5u) + 3u * vp_word(cell.l2 + 192u);
+    return cell;
 }
 
 // The node around a voxel.
@@ -50,300 +127,277 @@ struct VpNode {
     dim: i32,           // its side: 4096, 128 or 8
     constant: bool,     // whether it has one value
     value: f32,         // that value
-    record: u32,        // else the word at which its L3 record begins
+    record: vec3u,      // its L3 record, or one that says the same
 }
 
 fn vp_constant(p: vec3i, dim: i32, value: f32) -> VpNode {
-    return VpNode(p & vec3i(-dim), dim, true, value, VP_NONE);
+    return VpNode(p & vec3i(-dim), dim, true, value, vec3u(0u, VP_NONE, bitcast<u32>(value)));
 }
 
-// How many bits of a mask are on before bit i, or VP_NONE if bit i is off. Behind the mask's words lie
-// the counts before each of them, two to a word.
-fn vp_rank(mask_at: u32, ranks_at: u32, i: u32) -> u32 {
-    let word = i >> 5u;
-    let bits = vp_word(mask_at + word);
-    let bit = 1u << (i & 31u);
-    if (bits & bit) == 0u {
-        return VP_NONE;
+fn vp_find(g: VpGrid, cell: VpCell, p: vec3i) -> VpNode {
+    if cell.l2 == VP_NONE {
+        return vp_constant(p, cell.dim, cell.value);
     }
-    let before = (vp_word(ranks_at + (word >> 1u)) >> (16u * (word & 1u))) & 0xffffu;
-    return before + countOneBits(bits & (bit - 1u));
-}
-
-fn vp_link_constant(p: vec3i, dim: i32, link: u32) -> VpNode {
-    return vp_constant(p, dim, bitcast<f32>(vp_word(vp_word(9u) + (link & 0x3fffffffu))));
-}
-
-fn vp_find(g: VpGrid, frame: u32, p: vec3i) -> VpNode {
-    let cell = (p - g.origin) >> vec3u(7u);
-    if any(cell < vec3i(0)) || any(cell >= g.cells * g.roots) {
-        return vp_constant(p, 128, g.background);
-    }
-    // Root: one word a frame and L1 node.
-    let r = cell / g.cells;
-    let root_count = u32(g.roots.x * g.roots.y * g.roots.z);
-    let root = u32((r.x * g.roots.y + r.y) * g.roots.z + r.z);
-    let l1 = vp_word(g.root_at + frame * root_count + root);
-    if l1 == 0u {
-        return vp_constant(p, 128, g.background);
-    }
-    if (l1 >> 31u) == 1u {
-        return vp_link_constant(p, 4096, l1);
-    }
-    // L1: mask, ranks, one link a child.
-    let c = cell - r * g.cells;
-    let i = u32((c.x * g.cells.y + c.y) * g.cells.z + c.z);
-    let mask_words = u32(g.cells.x * g.cells.y * g.cells.z + 31) >> 5u;
-    let ranks_at = l1 + mask_words;
-    let child = vp_rank(l1, ranks_at, i);
-    if child == VP_NONE {
-        return vp_constant(p, 128, g.background);
-    }
-    let link = vp_word(ranks_at + ((mask_words + 1u) >> 1u) + child);
-    if (link >> 31u) == 1u {
-        return vp_link_constant(p, 128, link);
-    }
-    // L2: mask, ranks, first record.
-    let l2 = vp_word(3u) + 193u * link;
     let b = vec3u(p >> vec3u(3u)) & vec3u(15u);
-    let region = vp_rank(l2, l2 + 128u, (b.x * 16u + b.y) * 16u + b.z);
+    let region = vp_rank(cell.l2, cell.l2 + 128u, (b.x * 16u + b.y) * 16u + b.z);
     if region == VP_NONE {
         return vp_constant(p, 8, g.background);
     }
     // L3: three words. A constant without a mask is one value; with one it still may be, but its
     // voxels are looked up.
-    let record = vp_word(5u) + 3u * (vp_word(l2 + 192u) + region);
-    let constant = (vp_word(record) & 7u) == 0u && (vp_word(record + 1u) & VP_NO_MASK) == VP_NO_MASK;
-    return VpNode(p & vec3i(-8), 8, constant, bitcast<f32>(vp_word(record + 2u)), record);
+    let at = cell.records + 3u * region;
+    let record = vec3u(vp_word(at), vp_word(at + 1u), vp_word(at + 2u));
+    let constant = (record.x & 7u) == 0u && (!VP_MASKS || (record.y & VP_NO_MASK) == VP_NO_MASK);
+    return VpNode(p & vec3i(-8), 8, constant, bitcast<f32>(record.z), record);
 }
 
-// What a brick's texel says of voxel v (0 to 7 on each axis).
-fn vp_texel_value(g: VpGrid, word0: u32, word2: u32, v: vec3i) -> f32 {
-    let codec = word0 & 7u;
-    if codec == 0u {
-        return bitcast<f32>(word2);
+// How the voxels of a node are read.
+struct VpBrick {
+    min: vec3i,         // its smallest corner
+    codec: u32,         // its tag; 0: no texels
+    axis: u32,          // for bc7 the packing axis
+    page: u32,          // the texture
+    shift: vec3i,       // from a voxel to its texel there; for bc7 from 0 to the brick's first
+    offset: f32,        // a texel's value is offset + scale · texel
+    scale: f32,
+    mask: u32,          // word at which its mask begins, or VP_NONE
+    rule: u32,          // what inactive voxels are
+}
+
+fn vp_brick(g: VpGrid, node: VpNode) -> VpBrick {
+    let r = node.record;
+    let codec = r.x & 7u;
+    var brick = VpBrick(node.min, codec, (r.x >> 3u) & 3u, 0u, vec3i(0), bitcast<f32>(r.z), 0.0, VP_NONE, r.y >> 30u);
+    let mask = r.y & VP_NO_MASK;
+    if VP_MASKS && mask != VP_NO_MASK && brick.rule != 3u {
+        brick.mask = vp_word(7u) + 16u * mask;
     }
-    let slot = word0 >> 5u;
+    if codec == 0u {
+        return brick;
+    }
     let atlas = 12u + 4u * (codec - 1u);
     let columns = vp_word(atlas);
     let slab_bricks = columns * vp_word(atlas + 1u);
     let page_slabs = vp_word(atlas + 2u);
+    let slot = r.x >> 5u;
     let slab = slot / slab_bricks;
-    let place = slot % slab_bricks;
-    let corner = vec3i(vec3u(place % columns, place / columns, slab % page_slabs));
-    let page = slab / page_slabs;
-    var t: f32;
-    if codec == VP_BC7 {
-        // Four neighbours along the packing axis are the channels of one texel.
-        var a = v.zxy;
-        switch (word0 >> 3u) & 3u {
-            case 0u: { a = v.xyz; }
-            case 1u: { a = v.yxz; }
-            default: {}
-        }
-        let texel = vp_texel(codec, page, corner * vec3i(8, 8, 2) + vec3i(a.y, a.z, a.x >> 2u));
-        t = texel[a.x & 3];
+    let place = slot - slab * slab_bricks;
+    let row = place / columns;
+    brick.page = slab / page_slabs;
+    brick.shift = vec3i(vec3u(place - row * columns, row, slab - brick.page * page_slabs)) * 8;
+    if (VP_CODECS & 2u) != 0u && codec == VP_BC7 {
+        brick.shift.z /= 4;
     } else {
-        t = vp_texel(codec, page, corner * 8 + v).x;
+        brick.shift -= node.min;
     }
     if codec >= VP_F16 {
-        return t;
+        brick.offset = 0.0;
+        brick.scale = 1.0;
+    } else {
+        brick.offset = g.lo + g.span * (f32(r.z & 0xffffu) / 65535.0);
+        brick.scale = g.span * unpack2x16float(r.z).y;
     }
-    let minimum = f32(word2 & 0xffffu) / 65535.0;
-    let extent = unpack2x16float(word2).y;
-    return g.lo + g.span * (minimum + extent * t);
+    return brick;
 }
 
-fn vp_mask_bit(mask: u32, i: u32) -> bool {
-    return ((vp_word(vp_word(7u) + 16u * mask + (i >> 5u)) >> (i & 31u)) & 1u) == 1u;
+// What a brick's texel says of voxel p.
+fn vp_texel_value(brick: VpBrick, p: vec3i) -> f32 {
+    if brick.codec == 0u {
+        return brick.offset;
+    }
+    var t: f32;
+    if (VP_CODECS & 2u) != 0u && brick.codec == VP_BC7 {
+        // Four neighbours along the packing axis are the channels of one texel.
+        let v = p & vec3i(7);
+        let packed = select(select(v.z, v.y, brick.axis == 1u), v.x, brick.axis == 0u);
+        let place = vec3i(select(v.x, v.y, brick.axis == 0u), select(v.z, v.y, brick.axis == 2u), packed >> 2u);
+        let texel = vp_texel(VP_BC7, brick.page, brick.shift + place);
+        let pair = select(texel.xy, texel.zw, (packed & 2) != 0);
+        t = select(pair.x, pair.y, (packed & 1) != 0);
+    } else {
+        t = vp_texel(brick.codec, brick.page, brick.shift + p).x;
+    }
+    return brick.offset + brick.scale * t;
 }
 
-// The value of voxel p, which lies in the node.
-fn vp_node_value(g: VpGrid, node: VpNode, p: vec3i) -> f32 {
-    if node.constant {
-        return node.value;
-    }
+// The value of voxel p, which lies in the brick.
+fn vp_value(g: VpGrid, brick: VpBrick, p: vec3i) -> f32 {
     let v = p & vec3i(7);
-    let word1 = vp_word(node.record + 1u);
-    let mask = word1 & VP_NO_MASK;
-    let rule = word1 >> 30u;
-    if mask != VP_NO_MASK && rule != 3u {
+    if VP_MASKS && brick.mask != VP_NONE {
         let i = u32((v.x * 8 + v.y) * 8 + v.z);
-        if !vp_mask_bit(mask, i) {
-            let minus = rule == 1u || (rule == 2u && vp_mask_bit(mask + 1u, i));
+        let word = brick.mask + (i >> 5u);
+        if ((vp_word(word) >> (i & 31u)) & 1u) == 0u {
+            let minus = brick.rule == 1u || (brick.rule == 2u && ((vp_word(word + 16u) >> (i & 31u)) & 1u) == 1u);
             return select(g.background, -g.background, minus);
         }
     }
-    return vp_texel_value(g, vp_word(node.record), vp_word(node.record + 2u), v);
+    return vp_texel_value(brick, p);
 }
 
 fn vp_voxel(g: VpGrid, frame: u32, p: vec3i) -> f32 {
-    return vp_node_value(g, vp_find(g, frame, p), p);
+    return vp_value(g, vp_brick(g, vp_find(g, vp_cell(g, frame, VP_NOWHERE, p), p)), p);
 }
 
-// The voxels at the corners of the cell from p to p + 1, ordered by x + 2y + 4z. Seven cells of eight
-// along an axis lie inside one brick.
-fn vp_corners(g: VpGrid, frame: u32, p: vec3i) -> array<f32, 8> {
-    var corners: array<f32, 8>;
-    let node = vp_find(g, frame, p);
-    let inside = all((p & vec3i(7)) < vec3i(7));
-    for (var i = 0; i < 8; i++) {
-        let q = p + vec3i(i & 1, (i >> 1u) & 1, i >> 2u);
-        if inside {
-            corners[i] = vp_node_value(g, node, q);
-        } else {
-            corners[i] = vp_voxel(g, frame, q);
+// The corners of a cell: the voxels at z, ordered by x + 2y, then those at z + 1.
+struct VpCorners {
+    near: vec4f,
+    far: vec4f,
+}
+
+// Voxel p and its neighbours in x, in y and in both, as far as they lie in the brick; for the others
+// something else out of it. All are asked for at once, so that memory is waited for once.
+fn vp_quad(g: VpGrid, brick: VpBrick, p: vec3i) -> vec4f {
+    let a = p & vec3i(7);
+    let b = (p + 1) & vec3i(7);
+    var value = vec4f(g.background);
+    var on = vec4<bool>(true);
+    if VP_MASKS && brick.mask != VP_NONE {
+        let i = vec4u(vec4i(a.x, b.x, a.x, b.x) * 64 + vec4i(a.y, a.y, b.y, b.y) * 8 + a.z);
+        let at = brick.mask + (i >> vec4u(5u));
+        let bit = vec4u(1u) << (i & vec4u(31u));
+        on = (vp_words(at) & bit) != vec4u(0u);
+        var minus = vec4<bool>(brick.rule == 1u);
+        if brick.rule == 2u {
+            minus = (vp_words(at + 16u) & bit) != vec4u(0u);
+        }
+        value = select(value, -value, minus);
+    }
+    if any(on) {
+        let texels = vec4f(
+            vp_texel_value(brick, brick.min + a),
+            vp_texel_value(brick, brick.min + vec3i(b.x, a.y, a.z)),
+            vp_texel_value(brick, brick.min + vec3i(a.x, b.y, a.z)),
+            vp_texel_value(brick, brick.min + vec3i(b.x, b.y, a.z)),
+        );
+        value = select(value, texels, on);
+    }
+    return value;
+}
+
+// Seven cells of eight along an axis lie inside one brick; the others reach into its neighbours. Bits 0 to
+// 2 of a cell's edges say on which axes it does; a part of it, a subset of them, on which that part lies in
+// the next brick. Part 0 comes first, and again after the last.
+fn vp_edges(p: vec3i) -> u32 {
+    let edges = vec3u((p & vec3i(7)) == vec3i(7)) << vec3u(0u, 1u, 2u);
+    return edges.x | edges.y | edges.z;
+}
+
+fn vp_next_part(part: u32, edges: u32) -> u32 {
+    return (part - edges) & edges;
+}
+
+// The node that a part of the cell from p to p + 1 lies in.
+fn vp_part(g: VpGrid, frame: u32, cell: VpCell, p: vec3i, part: u32) -> VpNode {
+    let q = p + vec3i((vec3u(part) >> vec3u(0u, 1u, 2u)) & vec3u(1u));
+    return vp_find(g, vp_cell(g, frame, cell, q), q);
+}
+
+// The corners of the cell from p, which lies in the brick, to p + 1.
+fn vp_corners(g: VpGrid, frame: u32, cell: VpCell, brick: VpBrick, p: vec3i) -> VpCorners {
+    var c: VpCorners;
+    let edges = vp_edges(p);
+    var part = 0u;
+    loop {
+        var b = brick;
+        if part != 0u {
+            b = vp_brick(g, vp_part(g, frame, cell, p, part));
+        }
+        let inside = (vec4u(0u, 1u, 2u, 3u) & vec4u(edges & 3u)) == vec4u(part & 3u);
+        if (part & 4u) == 0u {
+            c.near = select(c.near, vp_quad(g, b, p), inside);
+        }
+        if (part & 4u) == (edges & 4u) {
+            c.far = select(c.far, vp_quad(g, b, p + vec3i(0, 0, 1)), inside);
+        }
+        part = vp_next_part(part, edges);
+        if part == 0u {
+            break;
         }
     }
-    return corners;
+    return c;
 }
 
 // p in index space, between voxels.
 fn vp_trilinear(g: VpGrid, frame: u32, p: vec3f) -> f32 {
-    let cell = floor(p);
-    let f = p - cell;
-    let c = vp_corners(g, frame, vec3i(cell));
-    let x = mix(vec4f(c[0], c[2], c[4], c[6]), vec4f(c[1], c[3], c[5], c[7]), f.x);
-    let y = mix(x.xz, x.yw, f.y);
-    return mix(y.x, y.y, f.z);
+    let low = floor(p);
+    let f = p - low;
+    let voxel = vec3i(low);
+    let cell = vp_cell(g, frame, VP_NOWHERE, voxel);
+    let c = vp_corners(g, frame, cell, vp_brick(g, vp_find(g, cell, voxel)), voxel);
+    let z = mix(c.near, c.far, f.z);
+    let y = mix(z.xy, z.zw, f.y);
+    return mix(y.x, y.y, f.x);
 }
 
-// ---- HDDA -----------------------------------------------------------------------------------------
+// ---- Signs ----------------------------------------------------------------------------------------
 //
-// A ray crosses plane k of axis a at t = (k − origin) / direction, always from the plane's number and
-// never accumulated. Its crossings, ordered by t and among equals by axis, are the order of its cells. A
-// DDA takes the next crossing; an HDDA the one that leaves a node, with all that come before it. So it
-// visits the cells of the DDA, less those it skipped, and needs no nudge over edges.
+// For surfaces, the zeros of a level set: what can be said of signs without fetching a texel.
 
-const VP_FAR = 3.0e38;
+const VP_POSITIVE = 0u;     // nothing is negative
+const VP_NEGATIVE = 1u;     // all is
+const VP_EITHER = 2u;       // the texels must say
 
-struct VpRay {
-    origin: vec3f,
-    direction: vec3f,
-    inverse: vec3f,
-}
-
-fn vp_ray(origin: vec3f, direction: vec3f) -> VpRay {
-    return VpRay(origin, direction, 1.0 / select(direction, vec3f(1.0), direction == vec3f(0.0)));
-}
-
-// A ray's place: the cell it is in, since when, and the axis of the face it came through (3: none).
-struct VpWalk {
-    cell: vec3i,
-    t: f32,
-    axis: i32,
-}
-
-fn vp_crossing(ray: VpRay, axis: i32, k: i32) -> f32 {
-    let t = (f32(k) - ray.origin[axis]) * ray.inverse[axis];
-    return select(t, VP_FAR, ray.direction[axis] == 0.0);
-}
-
-fn vp_before(t: f32, axis: i32, event_t: f32, event_axis: i32) -> bool {
-    return t < event_t || (t == event_t && axis < event_axis);
-}
-
-// The cell on an axis after all its crossings that come before an event: `start` before them, `end` at
-// most.
-fn vp_cell_at(ray: VpRay, event_t: f32, event_axis: i32, axis: i32, start: i32, end: i32) -> i32 {
-    let d = ray.direction[axis];
-    if start == end || d == 0.0 {
-        return start;
+// The sign of a node's voxels.
+fn vp_sign(g: VpGrid, node: VpNode) -> u32 {
+    if node.constant {
+        return u32(node.value < 0.0);
     }
-    let guess = i32(floor(ray.origin[axis] + d * event_t));
-    if d > 0.0 {
-        var cell = clamp(guess, start, end);
-        while cell < end && vp_before(vp_crossing(ray, axis, cell + 1), axis, event_t, event_axis) {
-            cell++;
-        }
-        while cell > start && !vp_before(vp_crossing(ray, axis, cell), axis, event_t, event_axis) {
-            cell--;
-        }
-        return cell;
+    let r = node.record;
+    var least = bitcast<f32>(r.z);
+    var most = least;
+    if (r.x & 7u) != 0u {
+        least = g.lo + g.span * (f32(r.z & 0xffffu) / 65535.0);
+        most = least + g.span * unpack2x16float(r.z).y;
     }
-    var cell = clamp(guess, end, start);
-    while cell > end && vp_before(vp_crossing(ray, axis, cell), axis, event_t, event_axis) {
-        cell--;
+    // Zeros are left to the texels, and what rounding might take for one: a millionth of the range.
+    let zero = 1e-6 * g.span;
+    let sign = select(select(VP_EITHER, VP_NEGATIVE, most < -zero), VP_POSITIVE, least > zero);
+    let rule = r.y >> 30u;
+    if !VP_MASKS || rule == 3u {
+        return sign;
     }
-    while cell < start && !vp_before(vp_crossing(ray, axis, cell + 1), axis, event_t, event_axis) {
-        cell++;
-    }
-    return cell;
+    let inactive = u32(select(g.background, -g.background, rule == 1u) < 0.0);
+    return select(VP_EITHER, sign, rule < 2u && sign == inactive);
 }
 
-fn vp_inside(cell: vec3i, low: vec3i, high: vec3i) -> bool {
-    return all(cell >= low) && all(cell < high);
+// Whether neither the region of p nor the seven next to it on its high sides have a record: then its
+// cells have no corner that is not background. Regions at the end of the L2 node count as others.
+fn vp_alone(cell: VpCell, p: vec3i) -> bool {
+    let b = vec3u(p >> vec3u(3u)) & vec3u(15u);
+    if cell.l2 == VP_NONE || any(b == vec3u(15u)) {
+        return false;
+    }
+    // Rows of 16 regions along z, two to a word.
+    let row = vec4u(b.x, b.x, b.x + 1u, b.x + 1u) * 16u + vec4u(b.y, b.y + 1u, b.y, b.y + 1u);
+    let at = cell.l2 + (row >> vec4u(1u));
+    let rows = vp_words(at) >> (16u * (row & vec4u(1u)));
+    return (((rows.x | rows.y | rows.z | rows.w) >> b.z) & 3u) == 0u;
 }
 
-// The ray's first cell in the box from low to high (outside). A walk outside of it means a miss.
-fn vp_enter(ray: VpRay, low: vec3i, high: vec3i) -> VpWalk {
-    let miss = VpWalk(low - 1, 0.0, 3);
-    let start = vec3i(clamp(floor(ray.origin), vec3f(-16777216.0), vec3f(16777216.0)));
-    var t = -VP_FAR;
-    var axis = 3;
-    for (var a = 0; a < 3; a++) {
-        let ahead = ray.direction[a] > 0.0;
-        var plane: i32;
-        if start[a] < low[a] && ahead {
-            plane = low[a];
-        } else if start[a] >= high[a] && !ahead {
-            plane = high[a];
-        } else if start[a] >= low[a] && start[a] < high[a] {
-            continue;
-        } else {
-            return miss;
-        }
-        let crossing = vp_crossing(ray, a, plane);
-        if axis == 3 || vp_before(t, axis, crossing, a) {
-            t = crossing;
-            axis = a;
+// The sign of a cell's corners that lie in the brick, where its mask tells.
+fn vp_idle(g: VpGrid, brick: VpBrick, p: vec3i) -> u32 {
+    if !VP_MASKS || brick.mask == VP_NONE {
+        return VP_EITHER;
+    }
+    let a = vec3u(p & vec3i(7));
+    let b = min(a + 1u, vec3u(7u));
+    // Rows of 8 voxels along z, four to a word.
+    let row = vec4u(a.x, a.x, b.x, b.x) * 8u + vec4u(a.y, b.y, a.y, b.y);
+    let at = brick.mask + (row >> vec4u(2u));
+    let shift = 8u * (row & vec4u(3u)) + a.z;
+    let pair = select(1u, 3u, b.z > a.z);
+    let rows = vp_words(at) >> shift;
+    if ((rows.x | rows.y | rows.z | rows.w) & pair) != 0u {
+        return VP_EITHER;
+    }
+    var minus = brick.rule == 1u;
+    if brick.rule == 2u {
+        let signs = vp_words(at + 16u) >> shift;
+        minus = (signs.x & 1u) == 1u;
+        let all = (signs.x & signs.y & signs.z & signs.w & pair) == pair;
+        if minus != all || (!minus && ((signs.x | signs.y | signs.z | signs.w) & pair) != 0u) {
+            return VP_EITHER;
         }
     }
-    if axis == 3 {
-        return VpWalk(start, 0.0, 3);
-    }
-    if t >= VP_FAR {
-        return miss;
-    }
-    var cell = start;
-    for (var a = 0; a < 3; a++) {
-        let ahead = ray.direction[a] > 0.0;
-        if a == axis {
-            cell[a] = select(high[a] - 1, low[a], ahead);
-        } else {
-            let end = select(min(low[a] - 1, start[a]), max(high[a], start[a]), ahead);
-            cell[a] = vp_cell_at(ray, t, axis, a, start[a], end);
-        }
-    }
-    return VpWalk(cell, t, axis);
-}
-
-// The crossing that leaves the box from low to high, which holds the cell: (t, axis).
-fn vp_exit(ray: VpRay, low: vec3i, high: vec3i) -> VpWalk {
-    let plane = select(low, high, ray.direction > vec3f(0.0));
-    var out = VpWalk(low, vp_crossing(ray, 0, plane.x), 0);
-    for (var a = 1; a < 3; a++) {
-        let t = vp_crossing(ray, a, plane[a]);
-        if vp_before(t, a, out.t, out.axis) {
-            out.t = t;
-            out.axis = a;
-        }
-    }
-    return out;
-}
-
-// The first cell behind the box from low to high, which holds the walk's cell. With a box of one cell
-// this is a DDA's step.
-fn vp_leave(ray: VpRay, walk: VpWalk, low: vec3i, high: vec3i) -> VpWalk {
-    var next = vp_exit(ray, low, high);
-    for (var a = 0; a < 3; a++) {
-        let ahead = ray.direction[a] > 0.0;
-        if a == next.axis {
-            next.cell[a] = select(low[a] - 1, high[a], ahead);
-        } else {
-            let end = select(low[a], high[a] - 1, ahead);
-            next.cell[a] = vp_cell_at(ray, next.t, next.axis, a, walk.cell[a], end);
-        }
-    }
-    return next;
+    return u32(select(g.background, -g.background, minus) < 0.0);
 }

@@ -110,7 +110,7 @@ impl KeptCodec {
 }
 
 impl Plain {
-    fn to_notes(&self) -> [Note; 3] {
+    fn to_notes(self) -> [Note; 3] {
         let value = self.value.to_bits();
         [Note::new(self.constant, value), Note::new(self.empty, 0), Note::new(self.f16, 0)]
     }
@@ -339,7 +339,7 @@ impl Encodings {
     }
 
     fn keep_plain(&mut self, ids: &[u32], plain: &[Plain]) -> io::Result<()> {
-        let notes: Vec<_> = plain.iter().map(Plain::to_notes).collect();
+        let notes: Vec<_> = plain.iter().copied().map(Plain::to_notes).collect();
         self.plain.add(self.ranges.len(), ids, &notes, &[])
     }
 }

@@ -1,0 +1,141 @@
+//! A pipeline for each thing that the tracer does, made when it is first asked for.
+//!
+//! One shader for every mode, codec and kind of grid takes registers and branches for all of them:
+//! `docs/decisions/0013-tracer-speed.md` has what that costs.
+
+use std::collections::HashMap;
+use std::sync::{Mutex, PoisonError};
+
+use super::{TRACER_WGSL, VOLPACK_WGSL};
+use crate::codec::Codec;
+use crate::pack::Pack;
+use crate::pack::tree::header;
+use crate::render::{Mode, Scene, Traversal};
+
+/// What occurs in a pack, as far as the shader cares.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Has {
+    /// Bit `tag` is on for each codec that has bricks; constants always may occur.
+    codecs: u32,
+    masks: bool,
+}
+
+impl Has {
+    /// What occurs in `pack`.
+    pub fn of(pack: &Pack) -> Self {
+        let used = Codec::WITH_TEXELS.into_iter().filter(|codec| pack.atlas(*codec).is_some());
+        Self {
+            codecs: used.fold(1, |bits, codec| bits | 1 << codec as u32),
+            masks: pack.tree[header::MASKS] > 0,
+        }
+    }
+}
+
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+struct Kind {
+    mode: u32,
+    hdda: bool,
+    level_set: bool,
+    has: Has,
+}
+
+/// Pixels of a workgroup, as `main` in `tracer.wgsl` has them: of the shapes from 8 × 4 to 16 × 16 the
+/// fastest on an NVIDIA H200, by 3 to 20 %.
+pub const WORKGROUP: [u32; 2] = [8, 16];
+
+/// The pipelines of one device, and what they share.
+pub struct Pipelines {
+    module: wgpu::ShaderModule,
+    bindings: wgpu::BindGroupLayout,
+    layout: wgpu::PipelineLayout,
+    made: Mutex<HashMap<Kind, wgpu::ComputePipeline>>,
+}
+
+impl Pipelines {
+    /// Compiles the shader's front end; pipelines follow when they are asked for.
+    pub fn new(device: &wgpu::Device) -> Self {
+        let shader = wgpu::ShaderModuleDescriptor {
+            label: Some("volpack + tracer"),
+            source: wgpu::ShaderSource::Wgsl(format!("{VOLPACK_WGSL}\n{TRACER_WGSL}").into()),
+        };
+        // What wgpu adds to loops, to keep foreign shaders from running for ever, costs this one a sixth
+        // of its time. Every access to memory stays checked.
+        let checks =
+            wgpu::ShaderRuntimeChecks { force_loop_bounding: false, ..wgpu::ShaderRuntimeChecks::checked() };
+        // SAFETY: without these checks all loops must end, and they do whatever the pack says: walks count
+        // steps up to MAX_STEPS or move towards a plane a cell at a time, `vp_settle` moves one way between
+        // two cells, parts of a cell are 8, halvings 24.
+        let module = unsafe { device.create_shader_module_trusted(shader, checks) };
+        let bindings = bindings(device);
+        let layout = device.create_pipeline_layout(&wgpu::PipelineLayoutDescriptor {
+            bind_group_layouts: &[Some(&bindings)],
+            ..Default::default()
+        });
+        Self { module, bindings, layout, made: Mutex::default() }
+    }
+
+    /// What pictures bind.
+    pub fn bindings(&self) -> &wgpu::BindGroupLayout {
+        &self.bindings
+    }
+
+    /// The pipeline that traces a scene from a pack.
+    pub fn get(&self, device: &wgpu::Device, has: Has, scene: &Scene) -> wgpu::ComputePipeline {
+        let kind = Kind {
+            mode: scene.mode as u32,
+            hdda: scene.traversal == Traversal::Hdda,
+            level_set: scene.level_set,
+            has,
+        };
+        let mut made = self.made.lock().unwrap_or_else(PoisonError::into_inner);
+        made.entry(kind).or_insert_with(|| self.make(device, kind)).clone()
+    }
+
+    fn make(&self, device: &wgpu::Device, kind: Kind) -> wgpu::ComputePipeline {
+        device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+            label: Some("tracer"),
+            layout: Some(&self.layout),
+            module: &self.module,
+            entry_point: Some("main"),
+            compilation_options: wgpu::PipelineCompilationOptions {
+                constants: &[
+                    ("MODE", kind.mode.into()),
+                    ("HDDA", kind.hdda.into()),
+                    ("LEVEL_SET", kind.level_set.into()),
+                    ("VP_CODECS", kind.has.codecs.into()),
+                    ("VP_MASKS", kind.has.masks.into()),
+                ],
+                ..Default::default()
+            },
+            cache: None,
+        })
+    }
+}
+
+fn bindings(device: &wgpu::Device) -> wgpu::BindGroupLayout {
+    let entry = |binding, ty| wgpu::BindGroupLayoutEntry {
+        binding,
+        visibility: wgpu::ShaderStages::COMPUTE,
+        ty,
+        count: None,
+    };
+    let buffer = |ty| wgpu::BindingType::Buffer { ty, has_dynamic_offset: false, min_binding_size: None };
+    let texture = wgpu::BindingType::Texture {
+        sample_type: wgpu::TextureSampleType::Float { filterable: false },
+        view_dimension: wgpu::TextureViewDimension::D3,
+        multisampled: false,
+    };
+    let mut entries = vec![
+        entry(0, buffer(wgpu::BufferBindingType::Uniform)),
+        entry(1, buffer(wgpu::BufferBindingType::Storage { read_only: true })),
+        entry(2, buffer(wgpu::BufferBindingType::Storage { read_only: false })),
+    ];
+    entries.extend((3..8).map(|binding| entry(binding, texture)));
+    device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: None, entries: &entries })
+}
+
+const _: () = {
+    assert!(Mode::Density as u32 == 0 && Mode::Depth as u32 == 1 && Mode::First as u32 == 2);
+    assert!(Mode::Bricks as u32 == 3 && Mode::Steps as u32 == 4 && Mode::Nodes as u32 == 5);
+    assert!(Mode::Normals as u32 == 6 && Mode::Lit as u32 == 7);
+};
