@@ -128,8 +128,11 @@ fn builds(args: &Args, files: &[PathBuf], folder: &Path) -> Result<Json, Box<dyn
     Ok(json!({ "sides": sides.iter().map(row).collect::<Vec<_>>(), "on_disk": on_disk }))
 }
 
-/// The peak, and the PSNR of each of our builds.
-fn our_psnrs(args: &Args, files: &[PathBuf], pack: &Path) -> Result<(f64, Vec<Option<f64>>), Box<dyn Error>> {
+/// The peak, and PSNRs against it; none where a build is exact.
+type Psnrs = (f64, Vec<Option<f64>>);
+
+/// What each of our builds has.
+fn our_psnrs(args: &Args, files: &[PathBuf], pack: &Path) -> Result<Psnrs, Box<dyn Error>> {
     let (mut peak, mut psnrs) = (0.0, Vec::new());
     for format in [Format::F16, Format::Unorm8, Format::Adaptive] {
         let settings = Settings { format, grids: vec![args.grid.clone()], ..Settings::default() };
