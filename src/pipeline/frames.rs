@@ -26,7 +26,7 @@ const OUTLINE: Stage = Stage { name: "outline", version: 1, travels: false };
 /// One grid of one frame, with its voxels unless they were not needed so far.
 type Frame = (Outline, Option<Vec<Brick>>);
 
-/// Reads frames, as many at a time as there are threads, and adds them in order.
+/// Reads frames, as many at a time as there are threads, and adds them in order: twice as many are in memory.
 pub(super) fn read(
     sequence: &SequenceInfo,
     selection: &Selection,
@@ -35,34 +35,56 @@ pub(super) fn read(
     alter: Option<Alter>,
     progress: &mut dyn Progress,
 ) -> Result<Vec<GridInput>> {
-    let scratch = |e| Error::io(std::env::temp_dir())(e);
     let mut grids: Vec<GridInput> = Vec::new();
     for grid in &selection.grids {
         let fetch = cache.is_some().then(|| fetch(sequence, grid, settings));
         grids.push(grid_input(sequence, grid, SequenceTree::new(fetch), settings));
     }
-    for window in sequence.frames.chunks(rayon::current_num_threads()) {
-        crate::interrupt::check()?;
+    let read = |window: &[FrameSource]| -> Vec<Result<Vec<Option<Frame>>>> {
         let read = |frame: &FrameSource| read_frame(frame, selection, settings, cache.map(|c| &**c), alter);
-        let frames: Vec<_> = window.par_iter().map(read).collect();
-        for (source, frame) in window.iter().zip(frames) {
-            for (grid, frame) in grids.iter_mut().zip(frame?) {
-                let Some((outline, voxels)) = frame else { continue };
-                let _span = trace::span("dedup");
-                grid.tree.add(outline, voxels).map_err(|e| match e {
-                    DedupError::Scratch { source } => scratch(source),
-                    DedupError::Background { .. } => Error::Input(format!(
-                        "{}: grid {:?}: {e}: export the whole sequence with one background",
-                        source.path.display(),
-                        grid.name
-                    )),
-                })?;
-            }
-            progress.advance(1);
-        }
+        window.par_iter().map(read).collect()
+    };
+    let mut windows = sequence.frames.chunks(rayon::current_num_threads());
+    let mut window = windows.next().unwrap_or_default();
+    let mut frames = read(window);
+    while !window.is_empty() {
+        crate::interrupt::check()?;
+        let next = windows.next().unwrap_or_default();
+        // The next frames are read while these are added.
+        let (added, later) = rayon::join(|| add(&mut grids, window, frames), || read(next));
+        added?;
+        progress.advance(window.len() as u64);
+        (window, frames) = (next, later);
     }
     grids.iter_mut().try_for_each(|grid| grid.tree.seal()).map_err(scratch)?;
     Ok(grids)
+}
+
+/// Adds frames to their grids, in order.
+fn add(
+    grids: &mut [GridInput],
+    sources: &[FrameSource],
+    frames: Vec<Result<Vec<Option<Frame>>>>,
+) -> Result<()> {
+    let _span = trace::span("dedup");
+    for (source, frame) in sources.iter().zip(frames) {
+        for (grid, frame) in grids.iter_mut().zip(frame?) {
+            let Some((outline, voxels)) = frame else { continue };
+            grid.tree.add(outline, voxels).map_err(|e| match e {
+                DedupError::Scratch { source } => scratch(source),
+                DedupError::Background { .. } => Error::Input(format!(
+                    "{}: grid {:?}: {e}: export the whole sequence with one background",
+                    source.path.display(),
+                    grid.name
+                )),
+            })?;
+        }
+    }
+    Ok(())
+}
+
+fn scratch(error: std::io::Error) -> Error {
+    Error::io(std::env::temp_dir())(error)
 }
 
 /// The selected grids of one file; `None` for those that it does not have.
