@@ -28,9 +28,14 @@ pub(crate) fn write(path: &Path, bytes: &[u8]) -> Result<()> {
 
 /// A file that will be moved to `path`, whose folder is made if need be.
 pub(crate) fn beside(path: &Path) -> Result<NamedTempFile> {
-    let folder = path.parent().filter(|f| *f != Path::new("")).unwrap_or(Path::new("."));
+    let folder = folder_of(path);
     fs::create_dir_all(folder).map_err(Error::io(folder))?;
     NamedTempFile::new_in(folder).map_err(Error::io(path))
+}
+
+/// The folder that a file is in.
+pub(crate) fn folder_of(path: &Path) -> &Path {
+    path.parent().filter(|folder| *folder != Path::new("")).unwrap_or(Path::new("."))
 }
 
 /// Moves a finished file to its place, readable by all as other outputs are.

@@ -1,6 +1,5 @@
 //! What each thread is doing, for `build --trace`: spans that Chrome's and Perfetto's viewers draw.
 
-use std::cell::Cell;
 use std::path::Path;
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::sync::{Mutex, OnceLock};
@@ -52,12 +51,8 @@ impl Drop for Span {
 /// A small number of this thread's own.
 fn thread() -> u32 {
     static NEXT: AtomicU32 = AtomicU32::new(0);
-    thread_local!(static OWN: Cell<Option<u32>> = const { Cell::new(None) });
-    OWN.with(|own| {
-        let number = own.get().unwrap_or_else(|| NEXT.fetch_add(1, Ordering::Relaxed));
-        own.set(Some(number));
-        number
-    })
+    thread_local!(static OWN: u32 = NEXT.fetch_add(1, Ordering::Relaxed));
+    OWN.with(|own| *own)
 }
 
 /// Writes what was recorded as Chrome's trace events.

@@ -19,3 +19,13 @@ pub fn psnr(psnr: Option<f64>) -> String {
 pub fn seconds(seconds: f64) -> String {
     if seconds < 1.0 { format!("{:.0} ms", seconds * 1e3) } else { format!("{seconds:.1} s") }
 }
+
+/// 1.23 %.
+pub fn percent(part: f64) -> String {
+    format!("{:.2} %", part * 100.0)
+}
+
+/// What is, and what may be where that is limited: 1.2 MiB of 9 MiB.
+pub fn of_limit<T>(is: T, limit: Option<T>, write: impl Fn(T) -> String) -> String {
+    write(is) + &limit.map(|limit| format!(" of {}", write(limit))).unwrap_or_default()
+}

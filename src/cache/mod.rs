@@ -105,9 +105,8 @@ impl Cache {
     /// The same for who asks not for its own sake: it counts as no use.
     pub fn peek<T: DeserializeOwned>(&self, key: &Key) -> Option<T> {
         self.blob(key).and_then(|blob| {
-            let bytes = self
-                .checked(self.store.read_blob(&blob))
-                .or_else(|| key.travels().then(|| self.fetch_blob(&blob))?)?;
+            let bytes = self.checked(self.store.read_blob(&blob));
+            let bytes = bytes.or_else(|| if key.travels() { self.fetch_blob(&blob) } else { None })?;
             let value = artefact::decode(&bytes);
             if value.is_none() {
                 self.warn(format!("an entry of {} is of another version: it is made anew", key.stage()));

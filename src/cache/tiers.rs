@@ -69,14 +69,13 @@ impl Cache {
 
     /// The action of a key, if the remote has it.
     pub(super) fn fetch_action(&self, key: &Key) -> Option<Entry> {
-        self.fetch_actions(&[*key]).pop()
+        if key.travels() { self.fetch_actions(&[*key]).pop() } else { None }
     }
 
-    /// The actions of those keys that the remote has.
+    /// The actions of those keys, which travel, that the remote has.
     fn fetch_actions(&self, keys: &[Key]) -> Vec<Entry> {
-        let keys: Vec<Key> = keys.iter().filter(|key| key.travels()).copied().collect();
         let wanted = |key: &Key| Wanted { digest: *key.digest(), limit: ACTION_BYTES as u64 };
-        let fetched = self.fetch(Map::Actions, &keys, wanted, Entry::of);
+        let fetched = self.fetch(Map::Actions, keys, wanted, Entry::of);
         fetched.into_iter().map(|(entry, _)| entry).collect()
     }
 

@@ -37,6 +37,7 @@ pub fn run(args: &BuildArgs, common: Common) -> Result<()> {
     }
     let cache = args.jobs.open_cache();
     let (all, limits) = args.jobs.budgets()?;
+    let is_limited = [all].iter().chain(limits.values()).any(|budget| *budget != Budget::default());
     let mut built: Vec<(String, Figures)> = Vec::new();
     let mut breaches: Vec<Breach> = Vec::new();
     for (name, job) in args.jobs.jobs(cache.as_ref(), VerifyLevel::All)? {
@@ -46,17 +47,18 @@ pub fn run(args: &BuildArgs, common: Common) -> Result<()> {
         let mut asset = json!({ "asset": name });
         let made = job.and_then(|job| {
             let outcome = build_one(&name, &job, args, common, &mut asset)?;
-            let limits = limits.get(&name).copied().unwrap_or_default();
-            check(&name, &job, &outcome, &limits, &mut breaches)
-        });
-        match made {
-            Ok(figures) => built.push((name, figures)),
-            Err(error) => {
-                asset["error"] = error.to_string().into();
-                // One bad asset does not keep the others from being built. All errors are printed, the
-                // last by the caller.
-                failure.replace(error).iter().for_each(super::print_error);
+            if is_limited {
+                let limits = limits.get(&name).copied().unwrap_or_default();
+                let figures = check(&name, &job, &outcome, &limits, &mut breaches)?;
+                built.push((name.clone(), figures));
             }
+            Ok(())
+        });
+        if let Err(error) = made {
+            asset["error"] = error.to_string().into();
+            // One bad asset does not keep the others from being built. All errors are printed, the
+            // last by the caller.
+            failure.replace(error).iter().for_each(super::print_error);
         }
         assets.push(asset);
     }
@@ -99,10 +101,9 @@ fn build_one(name: &str, job: &Job, args: &BuildArgs, common: Common, asset: &mu
     if !args.json && !common.quiet {
         print(name, job, &outcome, common.verbose);
     }
-    let seconds = outcome.seconds.iter().map(|(stage, s)| json!({ "stage": stage, "seconds": s }));
     asset["output"] = json!(job.output);
     asset["warnings"] = json!(outcome.warnings);
-    asset["seconds"] = seconds.collect();
+    asset["seconds"] = json!(outcome.build_report().stages);
     asset["pack"] = json!(outcome.summary);
     asset["verification"] = json!(outcome.verification);
     asset["made"] = json!(outcome.made);

@@ -17,7 +17,9 @@ use crate::manifest::{DEFAULT_NAME, expand};
 use crate::pack::Pack;
 use crate::pipeline::{Job, Outcome, VerifyLevel, build, check_structure, verify_against};
 use crate::report::model::{AssetReport, Figures, Report};
-use crate::report::{Baseline, Breach, Gallery, Reported, gallery, html, junit, markdown, schema};
+use crate::report::{
+    Baseline, Breach, Gallery, PackSummary, Reported, gallery, html, junit, markdown, schema,
+};
 use crate::settings::Budget;
 use crate::stages::metadata::digest;
 use crate::sweep::cheaper;
@@ -185,13 +187,14 @@ impl Gathering<'_> {
         reporter.finish();
         let (outcome, pack, cheaper, trouble) = made?;
         let build = outcome.build_report();
-        let Outcome { mut warnings, verification, .. } = outcome;
+        let Outcome { mut warnings, summary, verification, .. } = outcome;
         warnings.extend(trouble);
         let reported = Reported {
             name,
             pack: &pack,
             file: &job.output,
             digest: digest(&job.output)?.0,
+            summary,
             found: verification,
             build: Some(build),
             cheaper,
@@ -225,6 +228,7 @@ impl Gathering<'_> {
             pack: &pack,
             file: path,
             digest: digest(path)?.0,
+            summary: PackSummary::new(&pack),
             found,
             build: None,
             cheaper: None,

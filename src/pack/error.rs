@@ -9,7 +9,7 @@ pub enum PackError {
     /// The magic number is missing.
     #[error("not a volpack: it does not begin with the format's magic number")]
     NotPack,
-    /// A newer format.
+    /// Another version of the format.
     #[error("pack format version {0}, this volpack reads version {known}: {advice}", known = super::layout::VERSION,
         advice = if *.0 > super::layout::VERSION { "use a newer volpack" } else { "build the pack again" })]
     Version(u16),

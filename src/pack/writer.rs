@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use tempfile::NamedTempFile;
 
-use crate::aside::{LEFT_BEHIND, is_temporary, make_readable};
+use crate::aside::{LEFT_BEHIND, folder_of, is_temporary, make_readable};
 
 use super::layout::{ALIGNMENT, Chunk, Header, MAGIC, Section, VERSION, encoding};
 
@@ -202,10 +202,7 @@ impl PackWriter {
 
 /// A new file in the folder of `path`, which is made if need be.
 fn beside(path: &Path) -> io::Result<NamedTempFile> {
-    let folder = match path.parent() {
-        Some(folder) if folder != Path::new("") => folder,
-        _ => Path::new("."),
-    };
+    let folder = folder_of(path);
     std::fs::create_dir_all(folder)?;
     remove_left_behind(folder);
     tempfile::Builder::new().prefix(PREFIX).tempfile_in(folder)
@@ -213,6 +210,7 @@ fn beside(path: &Path) -> io::Result<NamedTempFile> {
 
 /// What the names of unfinished packs begin with.
 const PREFIX: &str = ".volpack-";
+
 fn remove_left_behind(folder: &Path) {
     let is_old = |entry: &std::fs::DirEntry| {
         let modified = entry.metadata().and_then(|m| m.modified()).ok();

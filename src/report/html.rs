@@ -9,7 +9,7 @@ use super::chart::{ChartError, Line, frames_svg, histogram_svg};
 use super::gallery::{Gallery, Png};
 use super::markdown::arrow;
 use super::model::{AssetReport, Figures, PackReport, Report};
-use crate::units::{bytes, count, seconds};
+use crate::units::{bytes, count, of_limit, percent, seconds};
 
 /// Why a page could not be made.
 #[derive(Debug, thiserror::Error)]
@@ -109,15 +109,10 @@ pub fn html(report: &Report, galleries: &[Option<Gallery>]) -> Result<String, Pa
         .map(|(i, asset)| view(report, i, asset, galleries.get(i).and_then(Option::as_ref)))
         .collect::<Result<_, _>>()?;
     let total = |label, key: &str, value: u64, budget: Option<u64>| {
-        let of = budget.map(|budget| format!(" of {}", bytes(budget))).unwrap_or_default();
-        fact(label, format!("/total/{key}"), value, bytes(value) + &of)
+        fact(label, format!("/total/{key}"), value, of_limit(value, budget, bytes))
     };
     let sums = &report.total;
-    let took = format!(
-        "{}{}",
-        seconds(sums.build_seconds),
-        sums.seconds_budget.map(|budget| format!(" of {}", seconds(budget))).unwrap_or_default()
-    );
+    let took = of_limit(sums.build_seconds, sums.seconds_budget, seconds);
     let mut offers: Vec<Offer> = report.assets.iter().enumerate().filter_map(offer).collect();
     offers.sort_by_key(|offer| std::cmp::Reverse(offer.saved));
     let page = Page {
@@ -165,10 +160,6 @@ fn optional(value: Option<f64>) -> String {
     value.map_or_else(|| "null".to_owned(), |value| value.to_string())
 }
 
-fn percent(part: f64) -> String {
-    format!("{:.2} %", part * 100.0)
-}
-
 fn view<'a>(
     report: &'a Report,
     i: usize,
@@ -180,7 +171,7 @@ fn view<'a>(
     Ok(Asset {
         id: id(i),
         report: asset,
-        breaches: report.breaches.iter().filter(|b| b.asset.as_ref() == Some(&asset.name)).collect(),
+        breaches: report.breaches_of(Some(&asset.name)).collect(),
         thumbnail: shot.map(|shot| data_url(&shot.pack)),
         pack: asset.pack.as_ref().map(|pack| details(&path, pack, gallery)).transpose()?,
     })

@@ -3,7 +3,7 @@
 use askama::Template;
 
 use super::model::{PackReport, Report};
-use crate::units::bytes;
+use crate::units::{bytes, of_limit, percent};
 
 #[derive(Template)]
 #[template(path = "report.md", config = "src/report/templates/askama.toml", escape = "none")]
@@ -30,30 +30,27 @@ pub fn markdown(report: &Report) -> Result<String, askama::Error> {
     let rows = report.assets.iter().map(|asset| Row {
         name: escape(&asset.name),
         error: asset.error.as_deref().map(escape),
-        is_bad: asset.error.is_some()
-            || report.breaches.iter().any(|breach| breach.asset.as_ref() == Some(&asset.name)),
+        is_bad: asset.error.is_some() || report.breaches_of(Some(&asset.name)).next().is_some(),
         cells: asset.pack.as_ref().map(cells),
     });
-    let sum = |sum, budget: Option<u64>| match budget {
-        Some(budget) => format!("{} of {}", bytes(sum), bytes(budget)),
-        None => bytes(sum),
-    };
     let sums = &report.total;
     let breaches = report.breaches.iter().map(|breach| escape(&breach.to_string())).collect();
-    let total = [sum(sums.gpu_bytes, sums.gpu_budget), sum(sums.file_bytes, sums.file_budget)];
+    let total = [
+        of_limit(sums.gpu_bytes, sums.gpu_budget, bytes),
+        of_limit(sums.file_bytes, sums.file_budget, bytes),
+    ];
     Page { report, rows: rows.collect(), breaches, total }.render()
 }
 
 fn cells(pack: &PackReport) -> [String; 8] {
     let figures = &pack.figures;
-    let percent = |part: Option<f64>| part.map_or_else(|| "-".to_owned(), |p| format!("{:.2} %", p * 100.0));
     [
         bytes(figures.gpu_bytes),
         bytes(figures.file_bytes),
         format!("{:.2}", figures.bits_per_voxel),
         figures.decibels(figures.psnr),
         figures.decibels(figures.worst_frame_psnr),
-        percent(figures.max_error),
+        figures.max_error.map_or_else(|| "-".to_owned(), percent),
         figures.flip.map_or_else(|| "-".to_owned(), |flip| format!("{flip:.4}")),
         pack.change.as_ref().map_or_else(
             || "-".to_owned(),

@@ -43,6 +43,8 @@ pub struct Reported<'a> {
     pub file: &'a Path,
     /// BLAKE3 of the file.
     pub digest: blake3::Hash,
+    /// Its sizes and counts.
+    pub summary: PackSummary,
     /// What was found of it.
     pub found: Option<VerifyReport>,
     /// How it came to be.
@@ -61,8 +63,7 @@ impl Reported<'_> {
     /// The figures, and every limit that is past.
     pub fn report(self) -> (PackReport, Vec<Breach>) {
         let pack = self.pack;
-        let summary = PackSummary::new(pack);
-        let figures = Figures::new(pack, &summary, self.found.as_ref(), self.build.as_ref());
+        let figures = Figures::new(pack, &self.summary, self.found.as_ref(), self.build.as_ref());
         let baseline = self.baseline.and_then(|baseline| baseline.figures(self.name));
         let breaches = budget::Checked {
             name: self.name,
@@ -81,7 +82,7 @@ impl Reported<'_> {
             change: baseline.map(|old| figures.change_from(old)),
             frames: frames::costs(pack, self.found.as_ref()),
             figures,
-            summary,
+            summary: self.summary,
             verification: self.found,
             build: self.build,
             cheaper: self.cheaper,
@@ -99,6 +100,11 @@ impl Reported<'_> {
 }
 
 impl Report {
+    /// The limits that an asset is past; `None` for those of all assets together.
+    fn breaches_of(&self, asset: Option<&str>) -> impl Iterator<Item = &Breach> {
+        self.breaches.iter().filter(move |breach| breach.asset.as_deref() == asset)
+    }
+
     /// Puts assets together, and checks what all of them may cost.
     pub fn new(
         assets: Vec<AssetReport>,

@@ -4,7 +4,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Deserializer};
 
-use super::quality::from_text_or_number;
+use super::quality::{check_above_zero, from_text_or_number};
 use super::{ByteSize, ErrorBound};
 
 /// Limits; each that is past is an error of its own, and none is checked that is not given.
@@ -78,9 +78,7 @@ impl<'de> Deserialize<'de> for Share {
 }
 
 fn above_zero<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<f64>, D::Error> {
-    let number = f64::deserialize(deserializer)?;
-    let is_sound = number.is_finite() && number > 0.0;
-    is_sound.then_some(Some(number)).ok_or_else(|| serde::de::Error::custom("a number above 0"))
+    check_above_zero(f64::deserialize(deserializer)?).map(Some).map_err(serde::de::Error::custom)
 }
 
 #[cfg(test)]

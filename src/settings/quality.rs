@@ -193,7 +193,7 @@ pub fn above_zero(text: &str) -> Result<f64, String> {
     check_above_zero(text.parse().unwrap_or(f64::NAN))
 }
 
-fn check_above_zero(v: f64) -> Result<f64, String> {
+pub(super) fn check_above_zero(v: f64) -> Result<f64, String> {
     if v > 0.0 && v.is_finite() { Ok(v) } else { Err("a number above 0".to_owned()) }
 }
 

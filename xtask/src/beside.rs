@@ -106,10 +106,10 @@ fn builds(args: &Args, files: &[PathBuf], folder: &Path) -> Result<Json, Box<dyn
     );
     println!("|---|---|---|---|---|---|---|---|");
     for (side, _) in &sides {
-        let seconds = median(&side.runs, |run| run.seconds);
+        let seconds = median(side.runs.iter().map(|run| run.seconds));
         let peer = side.beside.map(|(peer, limit)| (&sides[peer].0, limit));
         let [time, limit, bytes] = peer.map_or_else(Default::default, |(peer, limit)| {
-            let time = seconds / median(&peer.runs, |run| run.seconds);
+            let time = seconds / median(peer.runs.iter().map(|run| run.seconds));
             let verdict = if time <= limit { "met" } else { "**missed**" };
             let bytes = side.bytes as f64 / peer.bytes as f64;
             [format!("{time:.2}"), format!("{limit:.1}: {verdict}"), format!("{bytes:.2}")]
@@ -118,7 +118,7 @@ fn builds(args: &Args, files: &[PathBuf], folder: &Path) -> Result<Json, Box<dyn
             "| {} | {:.1} | {time} | {limit} | {:.1} | {:.2} | {bytes} | {} |",
             side.name,
             seconds * 1e3,
-            median(&side.runs, |run| run.peak_mib),
+            median(side.runs.iter().map(|run| run.peak_mib)),
             side.bytes as f64 / 1e6,
             side.psnr.map_or("exact".to_owned(), |db| format!("{db:.2}")),
         );

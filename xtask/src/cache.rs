@@ -8,6 +8,7 @@ use std::time::Instant;
 
 use serde_json::json;
 
+use crate::measured::median;
 use crate::peers;
 
 #[derive(clap::Args)]
@@ -131,10 +132,10 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
 
 fn print(cases: &[Case], seconds: &[Vec<f64>]) {
     println!("| build | ms | of cold | limit | of no cache |\n|---|---|---|---|---|");
-    let uncached = median(&seconds[0]);
+    let uncached = median(seconds[0].iter().copied());
     let mut cold = uncached;
     for (case, seconds) in cases.iter().zip(seconds) {
-        let time = median(seconds);
+        let time = median(seconds.iter().copied());
         if case.start == Start::Empty {
             cold = time;
         }
@@ -151,12 +152,6 @@ fn print(cases: &[Case], seconds: &[Vec<f64>]) {
         };
         println!("| {} | {:.1} | {} | {limit} | {} |", case.name, time * 1e3, of(cold), of(uncached));
     }
-}
-
-fn median(seconds: &[f64]) -> f64 {
-    let mut sorted = seconds.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    sorted[sorted.len() / 2]
 }
 
 /// A build with a cache makes what one without it makes.

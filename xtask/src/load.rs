@@ -11,6 +11,7 @@ use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::settings::{Format, Settings};
 use volpack::vdb::VdbFile;
 
+use crate::measured::median;
 use crate::{peers, scale};
 
 #[derive(clap::Args)]
@@ -64,7 +65,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 one.push(timed(|| fresh.frame(0, frame))?);
                 vdb.push(timed(|| read(&frames[frame]))?);
             }
-            let ms = |seconds: &[f64]| median(seconds) * 1e3;
+            let ms = |seconds: &[f64]| median(seconds.iter().copied()) * 1e3;
             println!(
                 "| {} | {} | {:.2} | {:.2} | {:.2} | {:.2} | {:.2} | {:.2} | {:.2} |",
                 format.name(),
@@ -72,7 +73,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 file_bytes / 1e6,
                 gpu_bytes / 1e6,
                 ms(&whole),
-                gpu_bytes / 1e9 / median(&whole),
+                gpu_bytes / 1e9 / median(whole.iter().copied()),
                 ms(&open),
                 ms(&one),
                 ms(&vdb),
@@ -103,10 +104,4 @@ fn timed<T, E: Into<Box<dyn Error>>>(work: impl FnOnce() -> Result<T, E>) -> Res
     let start = Instant::now();
     work().map(drop).map_err(Into::into)?;
     Ok(start.elapsed().as_secs_f64())
-}
-
-fn median(seconds: &[f64]) -> f64 {
-    let mut sorted = seconds.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    sorted[sorted.len() / 2]
 }

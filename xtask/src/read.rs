@@ -8,6 +8,7 @@ use std::time::Instant;
 use serde_json::{Value as Json, json};
 use volpack::vdb::{VdbFile, with_scalar_type};
 
+use crate::measured::median;
 use crate::peers;
 
 #[derive(clap::Args)]
@@ -117,13 +118,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
 /// The median over processes of each process's median read. Shared machines are noisy; both sides
 /// are treated alike.
 fn median_ms(runs: &[Json]) -> f64 {
-    let of_run = |run: &Json| {
-        median(run["seconds"].as_array().into_iter().flatten().filter_map(Json::as_f64).collect())
-    };
-    median(runs.iter().map(of_run).collect()) * 1e3
-}
-
-fn median(mut values: Vec<f64>) -> f64 {
-    values.sort_by(f64::total_cmp);
-    values[values.len() / 2]
+    let of_run =
+        |run: &Json| median(run["seconds"].as_array().into_iter().flatten().filter_map(Json::as_f64));
+    median(runs.iter().map(of_run)) * 1e3
 }

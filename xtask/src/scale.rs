@@ -57,10 +57,12 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             shorts.push(measured::run(&mut measured::build(&args.volpack, options, short, &output))?);
             longs.push(measured::run(&mut measured::build(&args.volpack, options, &long, &output))?);
         }
-        let of = |figure: fn(&measured::Run) -> f64| (median(&shorts, figure), median(&longs, figure));
+        let of = |figure: fn(&measured::Run) -> f64| {
+            (median(shorts.iter().map(figure)), median(longs.iter().map(figure)))
+        };
         let (short_s, long_s) = of(|run| run.seconds);
         let (short_mib, long_mib) = of(|run| run.peak_mib);
-        let usage = median(&longs, |run| run.cpu_seconds / run.seconds) / cores;
+        let usage = median(longs.iter().map(|run| run.cpu_seconds / run.seconds)) / cores;
         let verdict = |met: bool| if met { "met" } else { "**missed**" };
         let (time, memory) = (long_s / short_s / args.repeats as f64, long_mib / short_mib);
         println!(

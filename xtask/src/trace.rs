@@ -14,6 +14,7 @@ use volpack::render::{Image, Lens, Mode, Scene, Traversal, View};
 use volpack::settings::{Format, Settings};
 use volpack::sweep::nanovdb::{self, Quantise};
 
+use crate::measured::median;
 use crate::peers;
 
 #[derive(clap::Args)]
@@ -88,15 +89,15 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 let repeats = args.repeats + WARM_UP;
                 let (image, ms) = gpu.trace_timed(&uploaded, [0, 0], bounds, &scene, repeats)?;
                 apart = apart.or_else(|| theirs.as_ref().map(|t: &Theirs| t.apart(&image, &scene)));
-                let ms = ms.get(WARM_UP as usize..).unwrap_or_default().to_vec();
-                row.push((median(&ms), image.mean_steps()));
+                let ms = ms.get(WARM_UP as usize..).unwrap_or_default();
+                row.push((median(ms.iter().copied()), image.mean_steps()));
                 rows.push(json!({ "volume": name, "format": format, "traversal": format!("{traversal:?}"),
                     "milliseconds": ms, "mean_steps": image.mean_steps() }));
             }
             let [(hdda, hdda_steps), (dda, dda_steps)] = row[..] else { return Err("two traversals".into()) };
             let beside = match (&theirs, apart) {
                 (Some(t), Some(apart)) => {
-                    let theirs = median(&t.milliseconds);
+                    let theirs = median(t.milliseconds.iter().copied());
                     format!("{theirs:.3} | {:.2} | {apart:.1e}", hdda / theirs)
                 }
                 _ => " | | ".to_owned(),
@@ -117,12 +118,6 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
         std::fs::write(path, serde_json::to_string(&json!({ "device": gpu.name, "rows": rows }))?)?;
     }
     Ok(())
-}
-
-fn median(milliseconds: &[f64]) -> f64 {
-    let mut sorted = milliseconds.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    sorted.get(sorted.len() / 2).copied().unwrap_or(f64::NAN)
 }
 
 /// What NanoVDB makes of a scene.
@@ -182,9 +177,7 @@ impl Theirs {
             ours.pixels.iter().map(|p| f64::from(p[0])).zip(self.picture.iter().map(|v| f64::from(*v)));
         if scene.level_set {
             let both = pixels.filter(|(ours, theirs)| *ours >= 0.0 && *theirs >= 0.0);
-            return median(
-                &both.map(|(ours, theirs)| (ours / self.voxel - theirs).abs()).collect::<Vec<_>>(),
-            );
+            return median(both.map(|(ours, theirs)| (ours / self.voxel - theirs).abs()));
         }
         let opacity = |depth: f64| 1.0 - (-depth * self.voxel * scene.extinction).exp();
         pixels.map(|(ours, theirs)| (ours - opacity(theirs)).abs()).sum::<f64>() / self.picture.len() as f64
