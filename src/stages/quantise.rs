@@ -1,6 +1,6 @@
 //! Stage 7: texels to the bytes of a codec, slab by slab.
 
-use std::io;
+use std::{io, mem};
 
 use rayon::prelude::*;
 
@@ -45,13 +45,13 @@ pub struct Outcome {
 }
 
 impl Outcome {
-    /// What is known before any slab is encoded: constants and shapes.
-    pub fn before(allocation: &Allocation) -> Self {
+    /// What is known before any slab is encoded: constants and shapes. Their norms are here from now on.
+    pub fn before(allocation: &mut Allocation) -> Self {
         let axis = |coding: &Coding| match *coding {
             Coding::Shared(shape) => allocation.shapes[shape as usize].axis,
             _ => 2,
         };
-        Self { axes: allocation.codings.iter().map(axis).collect(), norms: allocation.norms.clone() }
+        Self { axes: allocation.codings.iter().map(axis).collect(), norms: mem::take(&mut allocation.norms) }
     }
 }
 
@@ -87,9 +87,8 @@ pub fn quantise<T: Send>(
     let group = (BRICKS_IN_FLIGHT / atlas.slab_bricks()).max(1);
     for first in (0..atlas.slabs).step_by(group as usize) {
         crate::interrupt::check().map_err(io::Error::from)?;
-        let slabs: Vec<&[Texture]> = (first..(first + group).min(atlas.slabs))
-            .map(|slab| atlas.slots(slab))
-            .map(|slots| &planned.texels[slots.start as usize..slots.end as usize])
+        let slabs: Vec<Vec<Texture>> = (first..(first + group).min(atlas.slabs))
+            .map(|slab| planned.textures(atlas.slots(slab)))
             .collect();
         make_kept(grids, atlas.codec, &slabs.concat())?;
         let runs = slabs

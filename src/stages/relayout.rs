@@ -1,5 +1,7 @@
 //! Stage 6: where each brick lies in the pages of the codecs' 3-D textures.
 
+use std::ops::Range;
+
 use super::allocate::{Allocation, Coding};
 use crate::codec::Codec;
 use crate::pack::{Atlas, MAX_TEXELS};
@@ -16,8 +18,27 @@ pub struct Layout {
 pub struct PlannedAtlas {
     /// Its geometry.
     pub atlas: Atlas,
-    /// What lies in each slot.
-    pub texels: Vec<Texture>,
+    /// For each slot a brick of its grid's pool or, with [`SHAPE`], one of the grid's shapes.
+    texels: Vec<u32>,
+    /// Each grid's first slot.
+    grids: Vec<u32>,
+}
+
+/// The bit of what is no brick.
+const SHAPE: u32 = 1 << 31;
+
+impl PlannedAtlas {
+    /// What lies in some slots.
+    pub fn textures(&self, slots: Range<u32>) -> Vec<Texture> {
+        let texture = |slot: u32| {
+            let of = match self.texels[slot as usize] {
+                shape if shape & SHAPE != 0 => TextureOf::Shape(shape & !SHAPE),
+                brick => TextureOf::Brick(brick),
+            };
+            Texture { grid: self.grids.partition_point(|first| *first <= slot) as u32 - 1, of }
+        };
+        slots.map(texture).collect()
+    }
 }
 
 /// What lies in a slot.
@@ -41,28 +62,32 @@ pub enum TextureOf {
 /// Gives each brick its place: in the order of the pools, which is that of first use, so that a frame needs few
 /// slabs. A shape lies where the first brick that uses it would.
 pub fn place(allocations: &[&Allocation]) -> Layout {
-    let mut texels: [Vec<Texture>; Codec::WITH_TEXELS.len()] = Default::default();
+    let mut planned = Codec::WITH_TEXELS.map(|codec| PlannedAtlas {
+        atlas: plan(codec, 0),
+        texels: Vec::new(),
+        grids: Vec::new(),
+    });
     let mut slots = Vec::new();
-    for (grid, allocation) in allocations.iter().enumerate() {
-        let mut put = |codec: Codec, of| {
-            let texels = &mut texels[codec as usize - 1];
-            texels.push(Texture { grid: grid as u32, of });
+    for allocation in allocations {
+        planned.iter_mut().for_each(|p| p.grids.push(p.texels.len() as u32));
+        let mut put = |codec: Codec, of: u32| {
+            let texels = &mut planned[codec as usize - 1].texels;
+            texels.push(of);
             texels.len() as u32 - 1
         };
         let mut shapes: Vec<Option<u32>> = vec![None; allocation.shapes.len()];
         let place = |(id, coding): (usize, &Coding)| match *coding {
             Coding::Empty | Coding::Constant(_) => 0,
-            Coding::Own(codec) => put(codec, TextureOf::Brick(id as u32)),
+            Coding::Own(codec) => put(codec, id as u32),
             Coding::Shared(shape) => *shapes[shape as usize]
-                .get_or_insert_with(|| put(allocation.shapes[shape as usize].codec, TextureOf::Shape(shape))),
+                .get_or_insert_with(|| put(allocation.shapes[shape as usize].codec, shape | SHAPE)),
         };
         slots.push(allocation.codings.iter().enumerate().map(place).collect());
     }
-    let planned = Codec::WITH_TEXELS
-        .into_iter()
-        .zip(texels)
-        .map(|(codec, texels)| PlannedAtlas { atlas: plan(codec, texels.len() as u32), texels });
-    Layout { atlases: planned.filter(|a| a.atlas.bricks > 0).collect(), slots }
+    for (codec, planned) in Codec::WITH_TEXELS.into_iter().zip(&mut planned) {
+        planned.atlas = plan(codec, planned.texels.len() as u32);
+    }
+    Layout { atlases: planned.into_iter().filter(|a| a.atlas.bricks > 0).collect(), slots }
 }
 
 /// Bricks across a page at most.

@@ -1,7 +1,7 @@
 //! Records of one size in an unnamed temporary file: what a sequence has too much of to keep in memory.
 
 use std::fs::File;
-use std::io::{self, Seek, SeekFrom, Write};
+use std::io;
 
 use bytemuck::Pod;
 
@@ -69,8 +69,7 @@ impl Scratch {
             Some(file) => file,
             none => none.insert(tempfile::tempfile()?),
         };
-        file.seek(SeekFrom::Start(at))?;
-        file.write_all(bytes)
+        write_at(file, bytes, at)
     }
 
     /// Visits the records at some places, in that order. They must have been flushed. Any number of threads may read.
@@ -113,6 +112,18 @@ impl Scratch {
 #[cfg(unix)]
 fn read_at(file: &File, bytes: &mut [u8], at: u64) -> io::Result<()> {
     std::os::unix::fs::FileExt::read_exact_at(file, bytes, at)
+}
+
+#[cfg(unix)]
+fn write_at(file: &File, bytes: &[u8], at: u64) -> io::Result<()> {
+    std::os::unix::fs::FileExt::write_all_at(file, bytes, at)
+}
+
+#[cfg(windows)]
+fn write_at(mut file: &File, bytes: &[u8], at: u64) -> io::Result<()> {
+    use std::io::{Seek, SeekFrom, Write};
+    file.seek(SeekFrom::Start(at))?;
+    file.write_all(bytes)
 }
 
 #[cfg(windows)]

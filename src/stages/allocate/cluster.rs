@@ -79,11 +79,11 @@ pub fn clustered(
     {
         let bricks = tree.pool.read(ids)?;
         for ((&id, &member), brick) in ids.iter().zip(members).zip(&bricks) {
-            let id = id as usize;
-            allocation.norms[id] =
-                brick.error_norm(&decoded[member as usize], &carried(&brick.active, rules[id]));
-            allocation.codings[id] = Coding::Shared(member);
-            allocation.ranges[id] = ranges[member as usize];
+            let brick_rule = rules[id as usize];
+            allocation.norms[id as usize] =
+                brick.error_norm(&decoded[member as usize], &carried(&brick.active, brick_rule));
+            allocation.codings[id as usize] = Coding::Shared(member);
+            allocation.borrowed.insert(id, ranges[member as usize]);
         }
     }
     Ok(allocation)

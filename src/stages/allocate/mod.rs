@@ -12,6 +12,7 @@ mod search;
 mod share;
 mod size;
 
+use std::collections::HashMap;
 use std::io;
 
 use half::f16;
@@ -19,6 +20,7 @@ use half::f16;
 use super::dedup::SequenceTree;
 use super::encodings::Encodings;
 use crate::codec::{BrickRange, Codec, OutOfRange, SequenceRange};
+use crate::volume::ValueRange;
 
 pub use adaptive::{AdaptiveGrid, Target, adaptive};
 pub use cluster::clustered;
@@ -29,10 +31,10 @@ pub struct Allocation {
     pub sequence: SequenceRange,
     /// How each brick of the pool is coded.
     pub codings: Vec<Coding>,
-    /// The range of each brick of the pool.
-    pub ranges: Vec<BrickRange>,
     /// Texels that several bricks share.
     pub shapes: Vec<Shape>,
+    /// Under which range a brick reads texels that were made for another.
+    pub borrowed: HashMap<u32, BrickRange>,
     /// The root of the squared error of each brick over the voxels that its texels give, as far as it is
     /// known before texels are made: 0 where [`super::quantise`] will measure it.
     pub norms: Vec<f64>,
@@ -77,10 +79,16 @@ pub enum AllocateError {
 }
 
 impl Allocation {
-    fn new(encodings: Encodings, coding: Coding) -> Self {
-        let (sequence, ranges) = (encodings.sequence, encodings.ranges.clone());
-        let (codings, norms) = (vec![coding; ranges.len()], vec![0.0; ranges.len()]);
-        Self { sequence, codings, ranges, shapes: Vec::new(), norms, empty_squares: Vec::new(), encodings }
+    fn new(encodings: Encodings, codings: Vec<Coding>, norms: Vec<f64>) -> Self {
+        Self {
+            sequence: encodings.sequence,
+            codings,
+            shapes: Vec::new(),
+            borrowed: HashMap::new(),
+            norms,
+            empty_squares: Vec::new(),
+            encodings,
+        }
     }
 
     /// The codec of a brick.
@@ -92,25 +100,26 @@ impl Allocation {
         }
     }
 
-    /// Raw texels need no range to be decoded: theirs is the tight one, for the majorant in it.
-    fn tighten(&mut self, tree: &SequenceTree) {
-        for ((range, coding), values) in self.ranges.iter_mut().zip(&self.codings).zip(&tree.brick_ranges) {
-            *range = match coding {
-                Coding::Own(Codec::F32) => self.sequence.fit(values.min, values.max),
-                // What bounds a voxel is what its texel decodes to.
-                Coding::Own(Codec::F16) => {
-                    let [min, max] = [values.min, values.max].map(|v| f16::from_f32(v).to_f32());
-                    self.sequence.fit(min, max)
-                }
-                _ => *range,
-            };
+    /// The range of a brick. Raw texels need none to be decoded: theirs is the tight one, for the majorant in it.
+    pub fn range(&self, tree: &SequenceTree, brick: u32) -> BrickRange {
+        let ValueRange { min, max } = tree.brick_ranges[brick as usize];
+        match self.codings[brick as usize] {
+            Coding::Own(Codec::F32) => self.sequence.fit(min, max),
+            // What bounds a voxel is what its texel decodes to.
+            Coding::Own(Codec::F16) => {
+                let [min, max] = [min, max].map(|v| f16::from_f32(v).to_f32());
+                self.sequence.fit(min, max)
+            }
+            _ => match self.borrowed.get(&brick) {
+                Some(range) => *range,
+                None => self.encodings.range(tree, brick),
+            },
         }
     }
 }
 
 /// Gives every brick of `tree` one codec.
 pub fn uniform(tree: &SequenceTree, encodings: Encodings, codec: Codec) -> Allocation {
-    let mut allocation = Allocation::new(encodings, Coding::Own(codec));
-    allocation.tighten(tree);
-    allocation
+    let bricks = tree.pool.len() as usize;
+    Allocation::new(encodings, vec![Coding::Own(codec); bricks], vec![0.0; bricks])
 }

@@ -402,11 +402,10 @@ impl<'a> GridSearch<'a> {
                 });
             }
         }
-        let mut allocation = Allocation::new(encodings, Coding::Empty);
-        (allocation.norms, allocation.codings) = (norms, codings);
+        let mut allocation = Allocation::new(encodings, codings, norms);
         for brick in (0..picks.len()).filter(|&brick| picks[brick] == Rung::Borrowed) {
             let loan = loans[&(brick as u32)];
-            allocation.ranges[brick] = loan.range;
+            allocation.borrowed.insert(brick as u32, loan.range);
             let lender = loan.lender as usize;
             allocation.codings[brick] = match allocation.codings[lender] {
                 Coding::Own(codec) => {
@@ -419,7 +418,6 @@ impl<'a> GridSearch<'a> {
                 shared => shared,
             };
         }
-        allocation.tighten(tree);
         let is_empty = |id: u32| picks[id as usize] == Rung::Empty;
         let square = |id: u32| allocation.norms[id as usize].powi(2);
         let frames = tree.frames.iter();

@@ -108,7 +108,7 @@ pub(super) fn loans(
                 Some(offers) => offers,
                 None => {
                     tree.fetch(&comparison.borrowers)?;
-                    near.move_to(encodings, &comparison.around, &lenders)?;
+                    near.move_to(encodings, tree, &comparison.around, &lenders)?;
                     let offers = comparison.nearest(encodings, tree, &near)?;
                     if let Some((cache, key)) = encodings.cache().zip(key) {
                         cache.put(&key, &offers);
@@ -200,6 +200,7 @@ impl Near {
     fn move_to(
         &mut self,
         encodings: &Encodings,
+        tree: &SequenceTree,
         around: &Range<usize>,
         lenders: &impl Fn(&Range<u32>) -> Vec<(u32, KeptCodec)>,
     ) -> io::Result<()> {
@@ -207,14 +208,18 @@ impl Near {
         for batch in around.clone() {
             if let Entry::Vacant(place) = self.batches.entry(batch) {
                 let lenders = lenders(&encodings.batches()[batch].ids);
-                place.insert(decoded(encodings, &lenders)?);
+                place.insert(decoded(encodings, tree, &lenders)?);
             }
         }
         Ok(())
     }
 }
 
-fn decoded(encodings: &Encodings, lenders: &[(u32, KeptCodec)]) -> io::Result<Vec<Lender>> {
+fn decoded(
+    encodings: &Encodings,
+    tree: &SequenceTree,
+    lenders: &[(u32, KeptCodec)],
+) -> io::Result<Vec<Lender>> {
     let mut places: [Vec<u32>; KeptCodec::ALL.len()] = Default::default();
     let mut tried = Vec::new();
     for &(id, codec) in lenders {
@@ -230,7 +235,7 @@ fn decoded(encodings: &Encodings, lenders: &[(u32, KeptCodec)]) -> io::Result<Ve
         let (bytes, axis) = (&bytes[place * size..][..size], axes[place]);
         let texels = decode(codec, bytes, axis, &SequenceRange::default(), BrickRange::SEQUENCE);
         let (mean, energy) = moments(&texels);
-        let extent = encodings.ranges[id as usize].extent.to_f64() * f64::from(encodings.sequence.span);
+        let extent = encodings.range(tree, id).extent.to_f64() * f64::from(encodings.sequence.span);
         let norm = costs[place].norm;
         // The part of its energy that is its own error is stretched with it.
         let trust = (1.0 - (norm / extent).powi(2) / energy.max(f64::MIN_POSITIVE)).max(0.0).sqrt();

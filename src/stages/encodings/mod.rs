@@ -142,8 +142,6 @@ const SAVE_EVERY: Duration = Duration::from_secs(2);
 pub struct Encodings {
     /// The range that brick ranges are fractions of.
     pub sequence: SequenceRange,
-    /// The range of each brick of the pool.
-    pub ranges: Vec<BrickRange>,
     terms: Terms,
     rules: Vec<InactiveRule>,
     plain: Kept<3>,
@@ -160,10 +158,6 @@ impl Encodings {
             Some(range) => SequenceRange::around(range.min, range.max)?,
             None => SequenceRange::default(),
         };
-        let ranges: Vec<BrickRange> = match terms.range {
-            RangeMode::Sequence => vec![BrickRange::SEQUENCE; tree.brick_ranges.len()],
-            RangeMode::Brick => tree.brick_ranges.iter().map(|r| sequence.fit(r.min, r.max)).collect(),
-        };
         let batches = Batches::new(tree, cache, &sequence, &terms);
         Some(Self {
             rules: tree.brick_rules(),
@@ -172,7 +166,6 @@ impl Encodings {
             batches,
             saved: Instant::now(),
             sequence,
-            ranges,
             terms,
         })
     }
@@ -207,6 +200,17 @@ impl Encodings {
         })
     }
 
+    /// What 0 and 1 of a brick's own texels stand for.
+    pub fn range(&self, tree: &SequenceTree, id: u32) -> BrickRange {
+        match self.terms.range {
+            RangeMode::Sequence => BrickRange::SEQUENCE,
+            RangeMode::Brick => {
+                let values = tree.brick_ranges[id as usize];
+                self.sequence.fit(values.min, values.max)
+            }
+        }
+    }
+
     /// Whether a brick's texels give all of its voxels.
     pub fn is_whole(&self, id: u32) -> bool {
         self.rules[id as usize] == InactiveRule::Texel
@@ -215,7 +219,7 @@ impl Encodings {
     /// A brick as its texels shall be.
     pub fn prepare(&self, tree: &SequenceTree, id: u32, brick: &Brick) -> Texels {
         let (rule, range) = (self.rules[id as usize], tree.brick_ranges[id as usize]);
-        Texels::new(brick, carried(&brick.active, rule), (range.min, range.max), self.ranges[id as usize])
+        Texels::new(brick, carried(&brick.active, rule), (range.min, range.max), self.range(tree, id))
     }
 
     /// What decoded values cost a brick whose texels give the voxels in `carried`.
@@ -326,7 +330,7 @@ impl Encodings {
             Made::Texels(codec, tried) => {
                 let note = |(&cost, &axis)| [Note::new(cost, u32::from(axis))];
                 let notes: Vec<_> = tried.costs.iter().zip(&tried.axes).map(note).collect();
-                self.kept[codec as usize].add(self.ranges.len(), ids, &notes, &tried.bytes)
+                self.kept[codec as usize].add(self.rules.len(), ids, &notes, &tried.bytes)
             }
             Made::Plain(plain) => self.keep_plain(ids, &plain),
         }
@@ -340,7 +344,7 @@ impl Encodings {
 
     fn keep_plain(&mut self, ids: &[u32], plain: &[Plain]) -> io::Result<()> {
         let notes: Vec<_> = plain.iter().copied().map(Plain::to_notes).collect();
-        self.plain.add(self.ranges.len(), ids, &notes, &[])
+        self.plain.add(self.rules.len(), ids, &notes, &[])
     }
 }
 

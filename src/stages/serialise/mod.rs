@@ -88,7 +88,7 @@ pub fn serialise(
         ));
     }
     let boxes = grids.iter().map(CellBox::around).collect::<Result<Vec<_>, _>>()?;
-    let mut words = TreeWords::build(grids, &boxes, &layout);
+    let words = TreeWords::new(grids, &boxes, &layout.atlases);
 
     let level = zstd_level.unwrap_or(0);
     let names: String = grids.iter().map(|g| g.name.as_str()).collect();
@@ -125,11 +125,12 @@ pub fn serialise(
         spec(kind::FRAME_CHUNKS, size_of_val(&*lists)),
         spec(kind::PROVENANCE, provenance.len()),
         spec(kind::FRAMES, frame_count * size_of::<FrameRecord>()),
-        spec(kind::TREE, words.words.len() * 4),
+        spec(kind::TREE, words.len() * 4),
     ]);
 
     let mut writer = PackWriter::create(path, specs)?;
-    let mut outcomes: Vec<Outcome> = grids.iter().map(|g| Outcome::before(g.allocation())).collect();
+    let mut outcomes: Vec<Outcome> =
+        grids.iter_mut().filter_map(|g| g.allocation.as_mut()).map(Outcome::before).collect();
     let mut sources: Vec<GridBricks> = grids
         .iter_mut()
         .filter_map(|g| Some(GridBricks { tree: &mut g.tree, allocation: g.allocation.as_mut()? }))
@@ -148,7 +149,6 @@ pub fn serialise(
             },
         )?;
     }
-    words.set_axes(grids, &outcomes);
     set_errors(&mut frames, grids, &outcomes);
     writer.section(bytemuck::cast_slice(&grid_records(grids, &outcomes)), level)?;
     writer.section(names.as_bytes(), level)?;
@@ -156,7 +156,13 @@ pub fn serialise(
     writer.section(bytemuck::cast_slice(&lists), level)?;
     writer.section(&provenance, level)?;
     writer.section(bytemuck::cast_slice(&frames), level)?;
-    writer.section(bytemuck::cast_slice(&words.words), level)?;
+    writer.begin()?;
+    let mut words = words.words(grids, &layout, &outcomes).peekable();
+    while words.peek().is_some() {
+        let chunk: Vec<u32> = words.by_ref().take(CHUNK_BYTES as usize / 4).collect();
+        let encoding = encoding(kind::TREE, 0);
+        writer.chunk(&compress_chunk(bytemuck::cast_slice(&chunk).to_vec(), encoding, level)?)?;
+    }
     Ok(writer.finish()?)
 }
 
@@ -166,8 +172,7 @@ pub fn serialise(
 /// [`SerialiseError::TooLarge`].
 pub fn tree_bytes(grids: &[GridInput]) -> Result<u64, SerialiseError> {
     let boxes = grids.iter().map(CellBox::around).collect::<Result<Vec<_>, _>>()?;
-    let nothing = Layout { atlases: Vec::new(), slots: Vec::new() };
-    Ok(TreeWords::build(grids, &boxes, &nothing).words.len() as u64 * 4)
+    Ok(TreeWords::new(grids, &boxes, &[]).len() as u64 * 4)
 }
 
 /// Bytes of tree, masks and texture pages: what a GPU holds.

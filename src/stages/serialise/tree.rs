@@ -90,15 +90,18 @@ impl CellBox {
     }
 }
 
-/// The tree section's words, and where its records are.
+/// The tree section's words: in memory what frames are found by; nodes, records and masks, which are most of it, are
+/// made as they are written.
 pub(super) struct TreeWords {
-    pub words: Vec<u32>,
-    record_at: usize,
+    /// Header, grids, roots and L1 nodes.
+    head: Vec<u32>,
+    constants: Vec<u32>,
+    len: usize,
 }
 
 impl TreeWords {
-    /// Builds them; without slots in `layout`, records stay zero.
-    pub fn build(grids: &[GridInput], boxes: &[CellBox], layout: &Layout) -> Self {
+    /// Plans them for texels in these atlases.
+    pub fn new(grids: &[GridInput], boxes: &[CellBox], atlases: &[PlannedAtlas]) -> Self {
         let mut constants = Interner::<u32>::default();
         let grids_at = HEADER_WORDS;
         let roots_at = grids_at + grids.len() * GRID_WORDS;
@@ -121,15 +124,15 @@ impl TreeWords {
         let record_at = node_at + nodes as usize * NODE_WORDS;
         let records: usize = grids.iter().map(|g| run_len(&g.tree)).sum();
         let mask_at = record_at + records * RECORD_WORDS;
-        let masks: usize = grids.iter().map(|g| g.tree.masks.items().len()).sum();
+        let masks: usize = grids.iter().map(|g| mask_len(&g.tree)).sum();
         let constant_at = mask_at + masks * MASK_WORDS;
-        let total = constant_at + constants.items().len();
+        let len = constant_at + constants.items().len();
 
-        let mut words = vec![0; HEADER_WORDS];
+        let mut head = vec![0; HEADER_WORDS];
         {
             use tree::header as h;
             for (place, value) in [
-                (h::WORDS, total),
+                (h::WORDS, len),
                 (h::GRIDS, grids.len()),
                 (h::GRID_AT, grids_at),
                 (h::NODE_AT, node_at),
@@ -141,62 +144,71 @@ impl TreeWords {
                 (h::CONSTANT_AT, constant_at),
                 (h::CONSTANTS, constants.items().len()),
             ] {
-                words[place] = value as u32;
+                head[place] = value as u32;
             }
-            for PlannedAtlas { atlas, .. } in &layout.atlases {
+            for PlannedAtlas { atlas, .. } in atlases {
                 let at = h::atlas(atlas.codec);
-                words[at..at + 3].copy_from_slice(&[atlas.columns, atlas.rows, atlas.page_slabs]);
+                head[at..at + 3].copy_from_slice(&[atlas.columns, atlas.rows, atlas.page_slabs]);
             }
         }
-        words.extend(headers);
-        words.extend(roots);
-        words.extend(l1.items());
+        head.extend(headers);
+        head.extend(roots);
+        head.extend(l1.items());
+        debug_assert_eq!(head.len(), node_at);
+        Self { head, constants: constants.items().to_vec(), len }
+    }
 
-        let mut first_record = 0u32;
-        for grid in grids {
-            for node in grid.tree.nodes.items() {
-                let mask: Vec<u32> =
+    /// How many there are.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// All of them.
+    pub fn words<'a>(
+        &'a self,
+        grids: &'a [GridInput],
+        layout: &'a Layout,
+        outcomes: &'a [Outcome],
+    ) -> impl Iterator<Item = u32> + 'a {
+        let nodes = with_first(grids, run_len).flat_map(|(grid, first_record)| {
+            grid.tree.nodes.items().iter().flat_map(move |node| {
+                let mut words: Vec<u32> =
                     node.children.iter().flat_map(|w| [*w as u32, (w >> 32) as u32]).collect();
-                words.extend(&mask);
-                words.extend(tree::ranks(&mask));
+                words.extend(tree::ranks(&words));
                 words.push(first_record + node.run as u32);
-            }
-            first_record += run_len(&grid.tree) as u32;
-        }
-        let mut first_mask = 0;
-        for (grid, slots) in grids.iter().zip(&layout.slots) {
-            for &record in grid.tree.runs.items() {
-                words.extend(l3_record(grid, record, slots, first_mask).to_words());
-            }
-            first_mask += grid.tree.masks.items().len() as u32;
-        }
-        words.resize(mask_at, 0);
-        for grid in grids {
-            words.extend(grid.tree.masks.items().iter().flat_map(|m| m.to_words()));
-        }
-        words.extend(constants.items());
-        debug_assert_eq!(words.len(), total);
-        Self { words, record_at }
+                words
+            })
+        });
+        let bricks = layout.slots.iter().zip(outcomes);
+        let records =
+            with_first(grids, mask_len).zip(bricks).flat_map(|((grid, first_mask), (slots, outcome))| {
+                let words = move |&entry| l3_record(grid, entry, slots, outcome, first_mask).to_words();
+                grid.tree.runs.items().iter().flat_map(words)
+            });
+        let masks = grids.iter().flat_map(|grid| grid.tree.masks.items()).flat_map(|mask| mask.to_words());
+        let head = self.head.iter().copied();
+        head.chain(nodes).chain(records).chain(masks).chain(self.constants.iter().copied())
     }
+}
 
-    /// Fills in the packing axes.
-    pub fn set_axes(&mut self, grids: &[GridInput], outcomes: &[Outcome]) {
-        let mut at = self.record_at;
-        for (grid, outcome) in grids.iter().zip(outcomes) {
-            for &record in grid.tree.runs.items() {
-                if let Payload::Brick(id) = grid.tree.record(record).payload()
-                    && grid.allocation().codec(id) != Codec::Constant
-                {
-                    self.words[at] |= u32::from(outcome.axes[id as usize]) << 3;
-                }
-                at += RECORD_WORDS;
-            }
-        }
-    }
+/// Grids, each with how much of something those before it have.
+fn with_first(
+    grids: &[GridInput],
+    len: impl Fn(&SequenceTree) -> usize,
+) -> impl Iterator<Item = (&GridInput, u32)> {
+    grids.iter().scan(0, move |first, grid| {
+        let own = *first;
+        *first += len(&grid.tree) as u32;
+        Some((grid, own))
+    })
 }
 
 fn run_len(tree: &SequenceTree) -> usize {
     tree.runs.items().len()
+}
+
+fn mask_len(tree: &SequenceTree) -> usize {
+    tree.masks.items().len()
 }
 
 fn grid_header(grid: &GridInput, bounds: &CellBox, root_at: usize) -> [u32; GRID_WORDS] {
@@ -253,18 +265,22 @@ fn frame_roots(
     roots
 }
 
-fn l3_record(grid: &GridInput, record: u32, slots: &[u32], first_mask: u32) -> L3Record {
-    let record = grid.tree.record(record);
-    let (codec, slot, word2) = match record.payload() {
-        Payload::Constant(value) => (Codec::Constant, 0, value.to_bits()),
+fn l3_record(grid: &GridInput, entry: u32, slots: &[u32], outcome: &Outcome, first_mask: u32) -> L3Record {
+    let record = grid.tree.record(entry);
+    let (codec, axis, slot, word2) = match record.payload() {
+        Payload::Constant(value) => (Codec::Constant, 0, 0, value.to_bits()),
         Payload::Brick(id) => {
-            let word2 = match grid.allocation().codings[id as usize] {
-                Coding::Empty => grid.tree.background.to_bits(),
-                Coding::Constant(value) => value.to_bits(),
-                _ => grid.allocation().ranges[id as usize].to_word(),
-            };
-            (grid.allocation().codec(id), slots[id as usize], word2)
+            let allocation = grid.allocation();
+            let brick = id as usize;
+            match allocation.codings[brick] {
+                Coding::Empty => (Codec::Constant, 0, 0, grid.tree.background.to_bits()),
+                Coding::Constant(value) => (Codec::Constant, 0, 0, value.to_bits()),
+                _ => {
+                    let range = allocation.range(&grid.tree, id).to_word();
+                    (allocation.codec(id), outcome.axes[brick], slots[brick], range)
+                }
+            }
         }
     };
-    L3Record { codec, axis: 0, slot, mask: record.mask().map(|m| first_mask + m), rule: record.rule, word2 }
+    L3Record { codec, axis, slot, mask: record.mask().map(|m| first_mask + m), rule: record.rule, word2 }
 }
