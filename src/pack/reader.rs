@@ -8,7 +8,7 @@ use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use bytemuck::Pod;
-use bytemuck::allocation::pod_collect_to_vec;
+use bytemuck::allocation::zeroed_vec;
 use memmap2::Mmap;
 
 use super::atlas::Atlas;
@@ -150,7 +150,7 @@ impl Pack {
             texel_sections: Vec::new(),
         };
         pack.tree = pack.records(kind::TREE)?;
-        let provenance = pack.whole_section(kind::PROVENANCE)?;
+        let provenance: Vec<u8> = pack.records(kind::PROVENANCE)?;
         pack.provenance = serde_json::from_slice(&provenance)
             .map_err(|e| PackError::Corrupt(format!("the provenance is not its JSON: {e}")))?;
         for record in pack.records::<AtlasRecord>(kind::ATLASES)? {
@@ -197,7 +197,7 @@ impl Pack {
         let records: Vec<GridRecord> = self.records(kind::GRIDS)?;
         let frames: Vec<FrameRecord> = self.records(kind::FRAMES)?;
         let lists: Vec<u32> = self.records(kind::FRAME_CHUNKS)?;
-        let names = self.whole_section(kind::NAMES)?;
+        let names: Vec<u8> = self.records(kind::NAMES)?;
         if records.len() != self.tree[super::tree::header::GRIDS] as usize {
             return corrupt("the grid table and the tree disagree about the number of grids");
         }
@@ -241,7 +241,8 @@ impl Pack {
         }
     }
 
-    fn whole_section(&self, kind: u32) -> Result<Vec<u8>, PackError> {
+    /// The entries of a section; bytes behind the last whole one are an error.
+    fn records<T: Pod>(&self, kind: u32) -> Result<Vec<T>, PackError> {
         let section = self.section(kind)?;
         if section.raw_bytes > SMALL_SECTION && section.raw_bytes / MAX_EXPANSION > section.stored_bytes {
             return corrupt(format!(
@@ -250,19 +251,19 @@ impl Pack {
                 section.raw_bytes
             ));
         }
-        let mut raw = Vec::new();
-        for chunk in chunk_range(section) {
-            raw.extend_from_slice(&self.chunk(section, chunk)?);
-        }
-        Ok(raw)
-    }
-
-    fn records<T: Pod>(&self, kind: u32) -> Result<Vec<T>, PackError> {
-        let raw = self.whole_section(kind)?;
-        if raw.len() % size_of::<T>() != 0 {
+        if !section.raw_bytes.is_multiple_of(size_of::<T>() as u64) {
             return corrupt(format!("the {} is not a whole number of entries", kind::name(kind)));
         }
-        Ok(pod_collect_to_vec(&raw))
+        let mut records: Vec<T> = zeroed_vec(section.raw_bytes as usize / size_of::<T>());
+        let mut rest: &mut [u8] = bytemuck::cast_slice_mut(&mut records);
+        for chunk in chunk_range(section) {
+            let chunk = self.chunk(section, chunk)?;
+            // The tables were found to agree about lengths.
+            let (now, later) = rest.split_at_mut(chunk.len());
+            now.copy_from_slice(&chunk);
+            rest = later;
+        }
+        Ok(records)
     }
 
     /// A chunk's bytes as they were before they were packed.

@@ -50,8 +50,13 @@ pub(super) fn read(
     while !window.is_empty() {
         crate::interrupt::check()?;
         let next = windows.next().unwrap_or_default();
-        // The next frames are read while these are added.
-        let (added, later) = rayon::join(|| add(&mut grids, window, frames), || read(next));
+        // The next frames are read while these are added: on this thread, so that what stays does not lie between what
+        // comes and goes with a frame, which would keep the allocator from using it anew.
+        let mut later = Vec::new();
+        let added = rayon::in_place_scope(|scope| {
+            scope.spawn(|_| later = read(next));
+            add(&mut grids, window, frames)
+        });
         added?;
         progress.advance(window.len() as u64);
         (window, frames) = (next, later);

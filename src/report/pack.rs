@@ -1,6 +1,6 @@
 //! A pack in figures.
 
-use std::collections::{BTreeMap, BTreeSet, HashSet};
+use std::collections::{BTreeMap, BTreeSet};
 
 use schemars::JsonSchema;
 use serde::Serialize;
@@ -58,11 +58,13 @@ impl PackSummary {
     pub fn new(pack: &Pack) -> Self {
         let words = &pack.tree;
         let record_at = words[header::RECORD_AT] as usize;
-        let records = words[record_at..].chunks_exact(RECORD_WORDS).take(words[header::RECORDS] as usize);
-        let unique: HashSet<&[u32]> = records.collect();
+        let record = |i: &u32| &words[record_at + *i as usize * RECORD_WORDS..][..RECORD_WORDS];
+        let mut unique: Vec<u32> = (0..words[header::RECORDS]).collect();
+        unique.sort_unstable_by_key(|i| record(i));
+        unique.dedup_by_key(|i| record(i));
         let mut codecs: BTreeMap<&'static str, CodecSummary> = BTreeMap::new();
-        for record in &unique {
-            let codec = Codec::from_tag(record[0] & 7).expect("the pack was checked");
+        for i in &unique {
+            let codec = Codec::from_tag(record(i)[0] & 7).expect("the pack was checked");
             codecs.entry(codec.name()).or_default().bricks += 1;
         }
         for atlas in &pack.atlases {

@@ -10,7 +10,7 @@ use super::encodings::{KeptCodec, Kind, Tried};
 use super::relayout::{self, PlannedAtlas, Texture, TextureOf};
 use crate::codec::{Codec, OutOfRange, Texels, decode, encode};
 use crate::trace;
-use crate::volume::{BRICKS_IN_FLIGHT, Brick};
+use crate::volume::Brick;
 
 /// One grid's bricks and how they are coded.
 pub struct GridBricks<'a> {
@@ -84,7 +84,8 @@ pub fn quantise<T: Send>(
     mut sink: impl FnMut(T) -> io::Result<()>,
 ) -> Result<(), QuantiseError> {
     let atlas = &planned.atlas;
-    let group = (BRICKS_IN_FLIGHT / atlas.slab_bricks()).max(1);
+    // Two slabs a thread: one of them may take longer than another.
+    let group = 2 * rayon::current_num_threads() as u32;
     for first in (0..atlas.slabs).step_by(group as usize) {
         crate::interrupt::check().map_err(io::Error::from)?;
         let slabs: Vec<Vec<Texture>> = (first..(first + group).min(atlas.slabs))

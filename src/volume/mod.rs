@@ -5,6 +5,7 @@
 mod brick;
 mod coord;
 mod frame;
+mod list;
 mod mask;
 mod pool;
 mod scratch;
@@ -12,6 +13,7 @@ mod scratch;
 pub use brick::{BRICK_VOXELS, Brick, InactiveRule};
 pub use coord::{BRICK_DIM, CELL_DIM, Coord, CoordBox, ROOT_DIM};
 pub use frame::{Cell, CellContent, Child, Constant, FlatFrame, FrameStats, ValueRange};
+pub use list::List;
 pub use mask::{Mask512, bits};
-pub use pool::{BRICKS_IN_FLIGHT, BrickPool, Home, Interner};
-pub use scratch::Scratch;
+pub use pool::{BRICKS_IN_FLIGHT, BrickPool, Interner};
+pub use scratch::{SCRATCH_HEAD, Scratch};

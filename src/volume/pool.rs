@@ -4,32 +4,27 @@ use std::collections::HashMap;
 use std::io;
 
 use bytemuck::{Pod, Zeroable};
+use hashbrown::HashTable;
+use hashbrown::hash_table::Entry;
 use xxhash_rust::xxh3::{xxh3_64, xxh3_128};
 
-use super::{BRICK_VOXELS, Brick, Mask512, Scratch};
+use super::{BRICK_VOXELS, Brick, List, Mask512, SCRATCH_HEAD, Scratch};
 
 /// Bricks that are worked on before what was made of them is put away: enough batches of an encoder for every core.
 pub const BRICKS_IN_FLIGHT: u32 = 4096;
 
-/// Where a brick comes from.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Home {
-    /// The frame that had it first, by its place among the frames that were added.
-    pub frame: u32,
-    /// Its place among that frame's bricks.
-    pub brick: u32,
-}
-
 /// Stores bricks so that equal ones are kept once, and gives them back by number.
 ///
-/// A brick may be known before its values are: they are put in when someone has need of them. Memory is 17 bytes a
-/// unique brick, and 25 to 50 more until [`BrickPool::seal`]; voxels, masks and digests are in scratch files.
+/// A brick may be known before its values are: they are put in when someone has need of them. Memory is 6 bytes a
+/// unique brick, and 35 to 60 more until [`BrickPool::seal`]; voxels, masks and digests are in scratch files.
 pub struct BrickPool {
-    by_digest: HashMap<Key, u32>,
-    homes: Vec<Home>,
-    /// [`BrickPool::active_hash`].
-    actives: Vec<u64>,
-    flags: Vec<Flags>,
+    by_digest: HashTable<u32>,
+    digests: List<Key>,
+    /// Hashes of the active masks.
+    actives: List<u64>,
+    /// The place of each among the bricks of the frame that had it first.
+    places: List<u32>,
+    flags: List<Flags>,
     facts: Scratch,
     values: Scratch,
 }
@@ -37,6 +32,11 @@ pub struct BrickPool {
 /// Half of a digest tells bricks apart as well: nobody has ever found two texts of one either, and while frames are
 /// added the table is the largest thing that grows with them.
 type Key = [u8; 16];
+
+/// A digest is its own hash.
+fn start(key: &Key) -> u64 {
+    u64::from_ne_bytes(*key.first_chunk().expect("a key is 16 bytes"))
+}
 
 #[derive(Clone, Copy)]
 struct Flags {
@@ -60,12 +60,13 @@ fn hash(active: &Mask512) -> u64 {
 impl Default for BrickPool {
     fn default() -> Self {
         Self {
-            by_digest: HashMap::new(),
-            homes: Vec::new(),
-            actives: Vec::new(),
-            flags: Vec::new(),
-            facts: Scratch::new(size_of::<Facts>()),
-            values: Scratch::new(BRICK_VOXELS * 4),
+            by_digest: HashTable::new(),
+            digests: List::default(),
+            actives: List::default(),
+            places: List::default(),
+            flags: List::default(),
+            facts: Scratch::new(size_of::<Facts>(), SCRATCH_HEAD),
+            values: Scratch::new(BRICK_VOXELS * 4, 0),
         }
     }
 }
@@ -73,12 +74,12 @@ impl Default for BrickPool {
 impl BrickPool {
     /// How many unique bricks there are.
     pub fn len(&self) -> u32 {
-        self.homes.len() as u32
+        self.places.len() as u32
     }
 
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
-        self.homes.is_empty()
+        self.places.is_empty()
     }
 
     /// BLAKE3 of what makes a brick: its values, and its mask where that is kept. Two bricks of one digest are one:
@@ -92,7 +93,8 @@ impl BrickPool {
         hasher.finalize().into()
     }
 
-    /// The number of the brick with this digest, and whether it is new. Its values are still to be put in.
+    /// The number of the brick with this digest, and whether it is new. Its values are still to be put in. `place` is
+    /// where it lies among the bricks of its frame.
     ///
     /// # Errors
     /// When the scratch file fails.
@@ -101,13 +103,19 @@ impl BrickPool {
         digest: &[u8; 32],
         active: &Mask512,
         keeps_mask: bool,
-        home: Home,
+        place: u32,
     ) -> io::Result<(u32, bool)> {
-        let next = self.homes.len() as u32;
-        let key = *digest.first_chunk().expect("a digest is 32 bytes");
-        let id = *self.by_digest.entry(key).or_insert(next);
+        let next = self.len();
+        let key: Key = *digest.first_chunk().expect("a digest is 32 bytes");
+        let digests = &self.digests;
+        let known = |id: &u32| digests[*id] == key;
+        let id = match self.by_digest.entry(start(&key), known, |id| start(&digests[*id])) {
+            Entry::Occupied(known) => *known.get(),
+            Entry::Vacant(place) => *place.insert(next).get(),
+        };
         if id == next {
-            self.homes.push(home);
+            self.digests.push(key);
+            self.places.push(place);
             self.actives.push(hash(active));
             self.flags.push(Flags { keeps_mask, is_there: false });
             self.facts.put(id, bytemuck::bytes_of(&Facts { active: *active, digest: *digest }))?;
@@ -115,7 +123,7 @@ impl BrickPool {
         }
         // Without a kept mask bricks are one if their values are. The pool's counts as active what is
         // active in any of them.
-        let known = &mut self.actives[id as usize];
+        let known = &mut self.actives[id];
         if *known != hash(active) {
             self.facts.flush()?;
             let mut facts: Facts = self.facts.read_as(&[id])?[0];
@@ -131,10 +139,9 @@ impl BrickPool {
     /// # Errors
     /// When the scratch file cannot be written.
     pub fn seal(&mut self) -> io::Result<()> {
-        self.by_digest = HashMap::new();
-        self.homes.shrink_to_fit();
-        self.actives.shrink_to_fit();
-        self.flags.shrink_to_fit();
+        self.by_digest = HashTable::new();
+        self.digests = List::default();
+        self.actives = List::default();
         self.facts.flush()?;
         self.values.flush()
     }
@@ -158,22 +165,26 @@ impl BrickPool {
 
     /// Whether a brick's mask is part of what it is.
     pub fn keeps_mask(&self, id: u32) -> bool {
-        self.flags[id as usize].keeps_mask
+        self.flags[id].keeps_mask
     }
 
-    /// Where a brick comes from.
-    pub fn home(&self, id: u32) -> Home {
-        self.homes[id as usize]
+    /// The place of a brick among those of the frame that had it first.
+    pub fn place(&self, id: u32) -> u32 {
+        self.places[id]
     }
 
-    /// A hash of which voxels of a brick are active, in any of the bricks of the source that it stands for.
-    pub fn active_hash(&self, id: u32) -> u64 {
-        self.actives[id as usize]
+    /// For each of some bricks a hash of which voxels are active, in any of the bricks of the source that it stands for.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be read back.
+    pub fn active_hashes(&self, ids: &[u32]) -> io::Result<Vec<u64>> {
+        let facts = self.facts.read_as::<Facts>(ids)?;
+        Ok(facts.iter().map(|facts| hash(&facts.active)).collect())
     }
 
     /// Whether a brick's values were put in.
     pub fn is_there(&self, id: u32) -> bool {
-        self.flags[id as usize].is_there
+        self.flags[id].is_there
     }
 
     /// Puts a brick's values in.
@@ -181,7 +192,7 @@ impl BrickPool {
     /// # Errors
     /// When the scratch file cannot be written.
     pub fn put(&mut self, id: u32, values: &[f32; BRICK_VOXELS]) -> io::Result<()> {
-        self.flags[id as usize].is_there = true;
+        self.flags[id].is_there = true;
         self.values.put(id, bytemuck::bytes_of(values))
     }
 
@@ -195,7 +206,7 @@ impl BrickPool {
         let mut each = ids.iter().zip(facts);
         self.values.read(ids, |values| {
             let (&id, facts) = each.next().expect("each brick has facts and values");
-            let keeps_mask = self.flags[id as usize].keeps_mask;
+            let keeps_mask = self.flags[id].keeps_mask;
             out.push(Brick {
                 values: bytemuck::pod_read_unaligned(values),
                 active: facts.active,

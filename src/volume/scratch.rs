@@ -12,10 +12,16 @@ const BLOCK: usize = 128 << 10;
 /// Bytes between two records that are read through rather than skipped: a call to the system costs about as much.
 const GAP: u64 = 16 << 10;
 
+/// What of small records stays in memory: those of some thousand bricks, which is a sequence of a second.
+pub const SCRATCH_HEAD: usize = 512 << 10;
+
 /// Records by their places, which may be filled in any order; one after another is the quickest. The file is made with
 /// the first of them.
 pub struct Scratch {
     record: usize,
+    /// The file's first bytes, up to `most`, which it does not have.
+    head: Vec<u8>,
+    most: usize,
     file: Option<File>,
     /// Put, and not in the file yet.
     buffer: Vec<u8>,
@@ -24,9 +30,10 @@ pub struct Scratch {
 }
 
 impl Scratch {
-    /// None yet, of that many bytes each.
-    pub fn new(record: usize) -> Self {
-        Self { record, file: None, buffer: Vec::new(), buffered: 0 }
+    /// None yet, of that many bytes each. The first `head` bytes of all stay in memory: a short sequence then needs no
+    /// file for what is small.
+    pub fn new(record: usize, head: usize) -> Self {
+        Self { record, head: Vec::new(), most: head, file: None, buffer: Vec::new(), buffered: 0 }
     }
 
     /// Bytes of each.
@@ -65,11 +72,46 @@ impl Scratch {
     }
 
     fn write(&mut self, at: u64, bytes: &[u8]) -> io::Result<()> {
+        let (early, late) = bytes.split_at(self.in_head(at, bytes.len()));
+        if !early.is_empty() {
+            let end = at as usize + early.len();
+            self.head.resize(self.head.len().max(end), 0);
+            self.head[at as usize..end].copy_from_slice(early);
+        }
+        if late.is_empty() {
+            return Ok(());
+        }
+        // Whoever reads across the end of the head finds all of it.
+        self.head.resize(self.most, 0);
         let file = match &mut self.file {
             Some(file) => file,
             none => none.insert(tempfile::tempfile()?),
         };
-        write_at(file, bytes, at)
+        write_at(file, late, at + early.len() as u64)
+    }
+
+    fn load(&self, at: u64, bytes: &mut [u8]) -> io::Result<()> {
+        let (early, late) = bytes.split_at_mut(self.in_head(at, bytes.len()));
+        if !early.is_empty() {
+            early.copy_from_slice(&self.head[at as usize..][..early.len()]);
+        }
+        if late.is_empty() {
+            return Ok(());
+        }
+        let file = self.file.as_ref().expect("records are flushed before they are read");
+        read_at(file, late, at + early.len() as u64)
+    }
+
+    /// How many of some bytes are in memory.
+    fn in_head(&self, at: u64, len: usize) -> usize {
+        (self.most as u64).saturating_sub(at).min(len as u64) as usize
+    }
+
+    fn load_span(&self, places: &[u32], bytes: &mut Vec<u8>) -> io::Result<u64> {
+        let first = self.at(places[0]);
+        bytes.resize((self.at(places[places.len() - 1]) - first) as usize + self.record, 0);
+        self.load(first, bytes)?;
+        Ok(first)
     }
 
     /// Visits the records at some places, in that order. They must have been flushed. Any number of threads may read.
@@ -77,19 +119,24 @@ impl Scratch {
     /// # Errors
     /// When the file cannot be read back.
     pub fn read(&self, places: &[u32], mut visit: impl FnMut(&[u8])) -> io::Result<()> {
-        let near = |a: &u32, b: &u32| b > a && self.at(*b) - self.at(*a) <= self.record as u64 + GAP;
         let mut bytes = Vec::new();
-        for mut run in places.chunk_by(near) {
-            while let Some(&first) = run.first() {
-                let first = self.at(first);
-                let fits = |&&place: &&u32| self.at(place) - first < BLOCK as u64;
-                let (now, later) = run.split_at(run.iter().take_while(fits).count());
-                bytes.resize((self.at(now[now.len() - 1]) - first) as usize + self.record, 0);
-                let file = self.file.as_ref().expect("records are flushed before they are read");
-                read_at(file, &mut bytes, first)?;
-                now.iter().for_each(|&p| visit(&bytes[(self.at(p) - first) as usize..][..self.record]));
-                run = later;
-            }
+        for places in together(self.record, places) {
+            let first = self.load_span(places, &mut bytes)?;
+            places.iter().for_each(|&p| visit(&bytes[(self.at(p) - first) as usize..][..self.record]));
+        }
+        Ok(())
+    }
+
+    /// The same, to change them.
+    ///
+    /// # Errors
+    /// When the file cannot be read back or written.
+    pub fn update(&mut self, places: &[u32], mut visit: impl FnMut(&mut [u8])) -> io::Result<()> {
+        let mut bytes = Vec::new();
+        for places in together(self.record, places) {
+            let first = self.load_span(places, &mut bytes)?;
+            places.iter().for_each(|&p| visit(&mut bytes[(self.at(p) - first) as usize..][..self.record]));
+            self.write(first, &bytes)?;
         }
         Ok(())
     }
@@ -107,6 +154,22 @@ impl Scratch {
     fn at(&self, place: u32) -> u64 {
         u64::from(place) * self.record as u64
     }
+}
+
+/// Splits places into those that are read together.
+fn together(record: usize, places: &[u32]) -> impl Iterator<Item = &[u32]> {
+    let mut rest = places;
+    std::iter::from_fn(move || {
+        let first = *rest.first()?;
+        let bytes = |from: u32, to: u32| u64::from(to - from) * record as u64;
+        let is_near = |&(&a, &b): &(&u32, &u32)| {
+            b > a && bytes(a, b) <= record as u64 + GAP && bytes(first, b) < BLOCK as u64
+        };
+        let near = rest.iter().zip(&rest[1..]).take_while(is_near).count();
+        let (now, later) = rest.split_at(1 + near);
+        rest = later;
+        Some(now)
+    })
 }
 
 #[cfg(unix)]
@@ -146,7 +209,12 @@ mod tests {
 
     #[test]
     fn records_come_back_in_the_order_asked_for() {
-        let mut scratch = Scratch::new(8);
+        for head in [0, 100_000] {
+            records_come_back(Scratch::new(8, head));
+        }
+    }
+
+    fn records_come_back(mut scratch: Scratch) {
         for first in (0..50_000u64).step_by(100) {
             let records: Vec<u64> = (first..first + 100).collect();
             scratch.put(first as u32, bytemuck::cast_slice(&records)).unwrap();
@@ -157,5 +225,10 @@ mod tests {
         let places: Vec<u32> = (0..50_001).step_by(3).chain([7, 50_000, 6, 6, 8]).collect();
         let expected: Vec<u64> = places.iter().map(|&p| if p == 7 { 70 } else { p.into() }).collect();
         assert_eq!(scratch.read_as::<u64>(&places).unwrap(), expected);
+        let changed = [3, 9, 12_499, 12_500, 12_501, 49_998];
+        scratch.update(&changed, |record| record[0] ^= 1).unwrap();
+        let changed = changed.map(|p| u64::from(p) ^ 1);
+        assert_eq!(scratch.read_as::<u64>(&[3, 9, 12_499, 12_500, 12_501, 49_998]).unwrap(), changed);
+        assert_eq!(scratch.read_as::<u64>(&[4, 12_502]).unwrap(), [4, 12_502]);
     }
 }

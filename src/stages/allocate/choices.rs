@@ -3,114 +3,204 @@
 use std::collections::HashMap;
 use std::io;
 
+use bytemuck::{Pod, Zeroable};
+use rayon::prelude::*;
+
 use super::rung::Rung;
 use super::share::Loan;
 use crate::stages::encodings::{Cost, Encodings, KeptCodec, Kind};
+use crate::volume::{SCRATCH_HEAD, Scratch};
 
 /// An L3 record is three words.
 pub(super) const RECORD_BITS: u32 = 96;
 
-/// What the rungs come to that have a cost of their own, in squared peaks. Looked up some hundred times a brick, and
-/// there for every brick of a sequence: so half as wide as costs are, and 48 bytes. They serve to choose between rungs;
-/// what a chosen one costs is read from the encodings.
-#[derive(Clone, Copy)]
-struct Choices {
+/// What the rungs come to that have a cost of their own, in squared peaks: half as wide as costs are, since all of a
+/// sequence's are looked at in every pass of a search. They serve to choose between rungs; what a chosen one costs is
+/// read from the encodings.
+#[derive(Clone, Copy, Pod, Zeroable)]
+#[repr(C)]
+pub(super) struct Choices {
     /// Over all users and over all the voxels that texels give.
     distortion: [f32; Rung::OWN],
     /// Over active voxels.
     active_squares: [f32; Rung::OWN],
+    /// How often the brick is used over all frames.
+    uses: u32,
+    /// How many L3 records it has: one in every run that it is in.
+    records: u32,
 }
 
 impl Choices {
-    const NONE: Self = Self { distortion: [0.0; Rung::OWN], active_squares: [0.0; Rung::OWN] };
+    /// Nothing costs anything yet.
+    pub fn new(uses: u32, records: u32) -> Self {
+        Self { uses, records, ..Self::zeroed() }
+    }
 
-    /// Notes squares. What is infinite is out of the question, so nothing else may be.
-    fn set(&mut self, rung: Rung, distortion: f64, active_squares: f64) {
+    /// Notes what a rung comes to.
+    fn set(&mut self, rung: Rung, cost: Cost, peak: f64) {
         let Some(i) = rung.own() else { return };
+        // What is infinite is out of the question, so nothing else may be.
         let narrow = |v: f64| if v.is_infinite() { f32::INFINITY } else { (v as f32).min(f32::MAX) };
-        (self.distortion[i], self.active_squares[i]) = (narrow(distortion), narrow(active_squares));
-    }
-
-    /// The distortion of a rung that has one of its own, or none at all.
-    fn distortion(&self, rung: Rung) -> f64 {
-        rung.own().map_or(0.0, |i| self.distortion[i].into())
-    }
-
-    /// The same over active voxels.
-    fn active_squares(&self, rung: Rung) -> f64 {
-        rung.own().map_or(0.0, |i| self.active_squares[i].into())
+        self.distortion[i] = narrow(in_peaks(cost.norm, peak) * f64::from(self.uses));
+        self.active_squares[i] = narrow(in_peaks(cost.active_norm, peak));
     }
 }
 
-/// What every rung comes to for every brick.
+/// What the rungs come to for one brick, its loan among them.
+#[derive(Clone, Copy)]
+pub(super) struct Weighed<'a> {
+    choices: &'a Choices,
+    loan: Option<&'a Loan>,
+    peak: f64,
+}
+
+impl Weighed<'_> {
+    /// How often the brick is used over all frames.
+    pub fn uses(&self) -> f64 {
+        self.choices.uses.into()
+    }
+
+    /// The error in squared peaks, over all users and over all the voxels that the texels give. That of a codec that
+    /// was not tried is none.
+    pub fn distortion(&self, rung: Rung) -> f64 {
+        match rung {
+            Rung::Borrowed => self.loan.map_or(f64::INFINITY, |loan| self.borrowed(loan)),
+            rung => rung.own().map_or(0.0, |i| self.choices.distortion[i].into()),
+        }
+    }
+
+    /// The same with some loan.
+    pub fn borrowed(&self, loan: &Loan) -> f64 {
+        in_peaks(loan.norm, self.peak) * self.uses()
+    }
+
+    /// The error for one user, over active voxels.
+    pub fn active_squares(&self, rung: Rung) -> f64 {
+        match rung {
+            Rung::Borrowed => self.loan.map_or(f64::INFINITY, |loan| in_peaks(loan.active_norm, self.peak)),
+            rung => rung.own().map_or(0.0, |i| self.choices.active_squares[i].into()),
+        }
+    }
+
+    /// The bits of the texels and of all records.
+    pub fn bits(&self, rung: Rung) -> f64 {
+        let records = if rung == Rung::Empty { 0 } else { self.choices.records };
+        f64::from(rung.texel_bits()) + f64::from(RECORD_BITS) * f64::from(records)
+    }
+}
+
+/// An error in squared peaks.
+fn in_peaks(norm: f64, peak: f64) -> f64 {
+    // Where all active values are the same, nothing but no error will do.
+    let peak = if peak > 0.0 { peak } else { f64::MIN_POSITIVE };
+    if norm == 0.0 { 0.0 } else { (norm / peak) * (norm / peak) }
+}
+
+/// Bricks that are looked at together: what a thread reads of the table at a time.
+const BLOCK: u32 = 2048;
+
+/// What every rung comes to for every brick. A long sequence's table is in scratch, and passes over it read it anew.
 pub(super) struct Table {
-    /// How often each brick is used over all frames.
-    pub uses: Vec<u32>,
-    /// How many L3 records each brick has: one in every run that it is in.
-    pub records: Vec<u32>,
     /// Maximum less minimum of active values.
     pub peak: f64,
-    choices: Vec<Choices>,
+    bricks: u32,
+    choices: Scratch,
     /// What bricks borrow, and which of them do.
     loans: HashMap<u32, Loan>,
     has_loan: Vec<bool>,
 }
 
 impl Table {
-    /// Nothing costs anything yet.
-    pub fn new(uses: Vec<u32>, records: Vec<u32>, peak: f64) -> Self {
-        let (choices, has_loan) = (vec![Choices::NONE; uses.len()], vec![false; uses.len()]);
-        Self { uses, records, peak, choices, loans: HashMap::new(), has_loan }
+    /// Of no brick yet.
+    pub fn new(peak: f64) -> Self {
+        let choices = Scratch::new(size_of::<Choices>(), SCRATCH_HEAD);
+        Self { peak, bricks: 0, choices, loans: HashMap::new(), has_loan: Vec::new() }
+    }
+
+    /// Adds the next bricks, and what the rungs come to for them.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be written.
+    pub fn add(
+        &mut self,
+        bricks: impl Iterator<Item = (Choices, [Cost; Rung::ALL.len()])>,
+    ) -> io::Result<()> {
+        for (mut choices, costs) in bricks {
+            Rung::ALL.into_iter().for_each(|rung| choices.set(rung, costs[rung as usize], self.peak));
+            self.choices.put(self.bricks, bytemuck::bytes_of(&choices))?;
+            self.bricks += 1;
+        }
+        self.has_loan.resize(self.bricks as usize, false);
+        self.choices.flush()
+    }
+
+    /// Notes what a rung comes to for some bricks, ascending.
+    ///
+    /// # Errors
+    /// When the scratch file fails.
+    pub fn weigh(&mut self, ids: &[u32], rung: Rung, costs: &[Cost]) -> io::Result<()> {
+        let mut costs = costs.iter();
+        self.choices.update(ids, |record| {
+            let mut choices: Choices = bytemuck::pod_read_unaligned(record);
+            choices.set(rung, *costs.next().expect("a cost a brick"), self.peak);
+            record.copy_from_slice(bytemuck::bytes_of(&choices));
+        })
     }
 
     /// How many bricks there are.
-    pub fn len(&self) -> usize {
-        self.uses.len()
+    pub fn len(&self) -> u32 {
+        self.bricks
     }
 
-    /// Notes what a rung comes to for a brick.
-    pub fn weigh(&mut self, id: u32, rung: Rung, cost: Cost) {
-        let distortion = self.in_peaks(cost.norm) * f64::from(self.uses[id as usize]);
-        let active_squares = self.in_peaks(cost.active_norm);
-        self.choices[id as usize].set(rung, distortion, active_squares);
+    /// What was noted of some bricks.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be read back.
+    pub fn read(&self, ids: &[u32]) -> io::Result<Vec<Choices>> {
+        self.choices.read_as(ids)
     }
 
-    /// A brick's error in squared peaks, over all its users and over all the voxels that its texels give. That of a
-    /// codec that was not tried is none.
-    pub fn distortion(&self, brick: usize, rung: Rung) -> f64 {
-        let borrowed = |loan: &Loan| self.in_peaks(loan.cost.norm) * f64::from(self.uses[brick]);
-        match rung {
-            Rung::Borrowed => self.loan(brick).map_or(f64::INFINITY, borrowed),
-            rung => self.choices[brick].distortion(rung),
-        }
+    /// What was noted of a brick and what it borrows.
+    pub fn weighed<'a>(&'a self, id: u32, choices: &'a Choices) -> Weighed<'a> {
+        Weighed { choices, loan: self.loan(id), peak: self.peak }
     }
 
-    /// The same for one user, over active voxels.
-    pub fn active_squares(&self, brick: usize, rung: Rung) -> f64 {
-        let borrowed = |loan: &Loan| self.in_peaks(loan.cost.active_norm);
-        match rung {
-            Rung::Borrowed => self.loan(brick).map_or(f64::INFINITY, borrowed),
-            rung => self.choices[brick].active_squares(rung),
-        }
+    /// Looks at every brick, on all cores. Blocks come in order.
+    fn blocks<T: Send>(&self, look: impl Fn(&[u32], &[Choices]) -> T + Sync) -> io::Result<Vec<T>> {
+        let blocks = (0..self.bricks.div_ceil(BLOCK)).into_par_iter();
+        let block = |block: u32| {
+            let ids: Vec<u32> = (block * BLOCK..(block * BLOCK + BLOCK).min(self.bricks)).collect();
+            Ok(look(&ids, &self.read(&ids)?))
+        };
+        blocks.map(block).collect()
     }
 
-    /// An error in squared peaks.
-    pub fn in_peaks(&self, norm: f64) -> f64 {
-        // Where all active values are the same, nothing but no error will do.
-        let peak = if self.peak > 0.0 { self.peak } else { f64::MIN_POSITIVE };
-        if norm == 0.0 { 0.0 } else { (norm / peak) * (norm / peak) }
+    /// Something of every brick, by its number.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be read back.
+    pub fn each<T: Send>(&self, of: impl Fn(u32, Weighed) -> T + Sync) -> io::Result<Vec<T>> {
+        let look = |ids: &[u32], choices: &[Choices]| -> Vec<T> {
+            ids.iter().zip(choices).map(|(&id, choices)| of(id, self.weighed(id, choices))).collect()
+        };
+        Ok(self.blocks(look)?.into_iter().flatten().collect())
     }
 
-    /// The bits of a brick's texels and of all its records.
-    pub fn bits(&self, brick: usize, rung: Rung) -> f64 {
-        let records = if rung == Rung::Empty { 0 } else { self.records[brick] };
-        f64::from(rung.texel_bits()) + f64::from(RECORD_BITS) * f64::from(records)
+    /// The sum of something over every brick, by the same steps on any number of threads.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be read back.
+    pub fn sum(&self, of: impl Fn(u32, Weighed) -> f64 + Sync) -> io::Result<f64> {
+        let look = |ids: &[u32], choices: &[Choices]| -> f64 {
+            ids.iter().zip(choices).map(|(&id, choices)| of(id, self.weighed(id, choices))).sum()
+        };
+        Ok(self.blocks(look)?.into_iter().sum())
     }
 
     /// What a brick borrows.
-    pub fn loan(&self, brick: usize) -> Option<&Loan> {
+    pub fn loan(&self, id: u32) -> Option<&Loan> {
         // Most have none, and a look at a flag is less than one into a map.
-        if self.has_loan[brick] { self.loans.get(&(brick as u32)) } else { None }
+        if self.has_loan[id as usize] { self.loans.get(&id) } else { None }
     }
 
     /// Gives a brick a loan.

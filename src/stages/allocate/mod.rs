@@ -102,7 +102,7 @@ impl Allocation {
 
     /// The range of a brick. Raw texels need none to be decoded: theirs is the tight one, for the majorant in it.
     pub fn range(&self, tree: &SequenceTree, brick: u32) -> BrickRange {
-        let ValueRange { min, max } = tree.brick_ranges[brick as usize];
+        let ValueRange { min, max } = tree.brick_ranges[brick];
         match self.codings[brick as usize] {
             Coding::Own(Codec::F32) => self.sequence.fit(min, max),
             // What bounds a voxel is what its texel decodes to.

@@ -9,14 +9,12 @@
 use std::io;
 use std::sync::LazyLock;
 
-use rayon::prelude::*;
-
 use super::adaptive::AdaptiveGrid;
-use super::choices::{Table, costs};
+use super::choices::{Choices, Table, Weighed, costs};
 use super::rung::Rung;
 use super::share::{Loan, loans};
 use super::{Allocation, Coding, Shape};
-use crate::stages::dedup::{Payload, SequenceTree};
+use crate::stages::dedup::{FrameTree, Payload, SequenceTree};
 use crate::stages::encodings::{Cost, Encodings, KeptCodec, Kind, Tried};
 use crate::trace;
 use crate::volume::{BRICKS_IN_FLIGHT, ValueRange};
@@ -53,7 +51,7 @@ pub(super) struct GridSearch<'a> {
     pub(super) voxel_size: f64,
     pub(super) table: Table,
     /// The coarsest step that each brick may have, for the sake of the frames it is in.
-    pub(super) least_step: Vec<u32>,
+    pub(super) least_step: Vec<u16>,
     /// The bricks that this search asked for in BC7. A cache may know of more, but what it knows by chance must not
     /// lead the search elsewhere.
     bc7_is_tried: Vec<bool>,
@@ -82,15 +80,15 @@ impl<'a> GridSearch<'a> {
             lends: vec![None; uses.len()],
             active_voxels: tree.frames.iter().map(|f| f.stats.active_leaf_voxels).sum(),
             voxel_size: grid.voxel_size,
-            table: Table::new(uses, records, peak),
+            table: Table::new(peak),
             encodings: grid.encodings,
             tree,
         };
-        let all: Vec<u32> = (0..search.table.len() as u32).collect();
+        let all: Vec<u32> = (0..uses.len() as u32).collect();
         for ids in all.chunks(BRICKS_IN_FLIGHT as usize) {
-            for (&id, (costs, _)) in ids.iter().zip(costs(&search.encodings, ids, &search.bc7_is_tried)?) {
-                Rung::ALL.into_iter().for_each(|rung| search.table.weigh(id, rung, costs[rung as usize]));
-            }
+            let costs = costs(&search.encodings, ids, &search.bc7_is_tried)?;
+            let choices = |&id: &u32| Choices::new(uses[id as usize], records[id as usize]);
+            search.table.add(ids.iter().map(choices).zip(costs.into_iter().map(|(costs, _)| costs)))?;
         }
         Ok(search)
     }
@@ -107,20 +105,20 @@ impl<'a> GridSearch<'a> {
     }
 
     /// The rung with the least D + λR; of equals the cheapest.
-    fn pick(&self, brick: usize, step: u32) -> Rung {
-        if let Some(rung) = self.lends[brick] {
+    fn pick(&self, id: u32, weighed: Weighed, step: u32) -> Rung {
+        if let Some(rung) = self.lends[id as usize] {
             return rung;
         }
-        let step = step.max(self.least_step[brick]);
+        let step = step.max(self.least_step[id as usize].into());
         if step == 0 {
             // The coarsest there is: no error is too large.
-            let possible = |rung: &Rung| self.table.distortion(brick, *rung).is_finite();
+            let possible = |rung: &Rung| weighed.distortion(*rung).is_finite();
             return Rung::ALL.into_iter().find(possible).unwrap_or(Rung::F32);
         }
         let lambda = lambda(step);
         let (mut best, mut least) = (Rung::F32, f64::INFINITY);
         for rung in Rung::ALL {
-            let cost = self.table.distortion(brick, rung) + lambda * self.table.bits(brick, rung);
+            let cost = weighed.distortion(rung) + lambda * weighed.bits(rung);
             if cost < least {
                 (best, least) = (rung, cost);
             }
@@ -128,15 +126,18 @@ impl<'a> GridSearch<'a> {
         best
     }
 
-    pub(super) fn picks(&self, step: u32) -> Vec<Rung> {
-        (0..self.table.len()).into_par_iter().map(|brick| self.pick(brick, step)).collect()
+    pub(super) fn picks(&self, step: u32) -> io::Result<Vec<Rung>> {
+        self.table.each(|id, weighed| self.pick(id, weighed, step))
     }
 
-    /// The squared error of all frames over active voxels, summed in the order of the bricks.
-    pub(super) fn squares(&self, picks: &[Rung]) -> f64 {
-        let each = picks.iter().enumerate();
-        each.map(|(brick, &rung)| f64::from(self.table.uses[brick]) * self.table.active_squares(brick, rung))
-            .sum()
+    /// The squared error of all frames over active voxels.
+    pub(super) fn squares(&self, picks: &[Rung]) -> io::Result<f64> {
+        self.table.sum(|id, weighed| weighed.uses() * weighed.active_squares(picks[id as usize]))
+    }
+
+    /// The same for what is picked at a step.
+    fn squares_at(&self, step: u32) -> io::Result<f64> {
+        self.table.sum(|id, weighed| weighed.uses() * weighed.active_squares(self.pick(id, weighed, step)))
     }
 
     /// Tries what was picked without having been tried. Whether there was any.
@@ -149,10 +150,8 @@ impl<'a> GridSearch<'a> {
         let unknown: Vec<u32> = unknown.map(|(id, _)| id).collect();
         self.encodings.make(self.tree, &unknown, &[Kind::Texels(KeptCodec::Bc7)], advance)?;
         for ids in unknown.chunks(BRICKS_IN_FLIGHT as usize) {
-            for (&id, cost) in ids.iter().zip(self.encodings.costs(ids, KeptCodec::Bc7)?) {
-                self.bc7_is_tried[id as usize] = true;
-                self.table.weigh(id, Rung::Bc7, cost);
-            }
+            self.table.weigh(ids, Rung::Bc7, &self.encodings.costs(ids, KeptCodec::Bc7)?)?;
+            ids.iter().for_each(|&id| self.bc7_is_tried[id as usize] = true);
         }
         Ok(!unknown.is_empty())
     }
@@ -166,9 +165,8 @@ impl<'a> GridSearch<'a> {
         let (step, alone) = self.at_psnr_with_loans(psnr, floor, advance)?;
         self.find_loans(&alone, step, advance)?;
         let (_, together) = self.at_psnr_with_loans(psnr, floor, advance)?;
-        let bits =
-            |picks: &[Rung]| (0..).zip(picks).map(|(brick, &rung)| self.table.bits(brick, rung)).sum::<f64>();
-        if bits(&together) < bits(&alone) {
+        let bits = |picks: &[Rung]| self.table.sum(|id, weighed| weighed.bits(picks[id as usize]));
+        if bits(&together)? < bits(&alone)? {
             return Ok(together);
         }
         self.forget_loans();
@@ -184,28 +182,26 @@ impl<'a> GridSearch<'a> {
         let allowed = Self::allowance(self.active_voxels, psnr);
         loop {
             let span = trace::span("search");
-            let step = first_step(|step| self.squares(&self.picks(step)) <= allowed);
+            let step = first_step(|step| Ok(self.squares_at(step)? <= allowed))?;
             drop(span);
-            let fine = self.picks(step);
+            let fine = self.picks(step)?;
             if self.try_unknown((0..).zip(fine.iter().copied()), advance)? {
                 continue;
             }
-            let mut picks = self.picks(step.saturating_sub(1));
-            let mut squares = self.squares(&picks);
-            for switch in switches(0, self, &picks, &fine) {
+            let mut picks = self.picks(step.saturating_sub(1))?;
+            let mut squares = self.squares(&picks)?;
+            for Switch { brick, squares: [before, after], .. } in switches(0, self, &picks, &fine)? {
                 if squares <= allowed {
                     break;
                 }
-                let (brick, uses) = (switch.brick, f64::from(self.table.uses[switch.brick]));
-                squares -= uses * self.table.active_squares(brick, picks[brick]);
-                squares += uses * self.table.active_squares(brick, switch.to);
-                picks[brick] = switch.to;
+                squares = squares - before + after;
+                picks[brick as usize] = fine[brick as usize];
             }
             // Differences were added up; the sum itself decides.
-            if self.squares(&picks) > allowed {
+            if self.squares(&picks)? > allowed {
                 picks = fine;
             }
-            self.spend_slack(&mut picks, allowed, step);
+            self.spend_slack(&mut picks, allowed, step)?;
             if !self.raise_frames(&picks, floor, step, advance)? {
                 return Ok((step, picks));
             }
@@ -214,21 +210,22 @@ impl<'a> GridSearch<'a> {
 
     /// The last brick that was made finer may have been a large one: where what it left over suffices for others to be
     /// coarser, they are, least loss for a bit first.
-    fn spend_slack(&self, picks: &mut [Rung], allowed: f64, step: u32) {
-        let coarser = self.picks(step.saturating_sub(SLACK_STEPS));
-        let (before, mut squares) = (picks.to_vec(), self.squares(picks));
-        for switch in switches(0, self, &coarser, &before).into_iter().rev() {
-            let (brick, uses) = (switch.brick, f64::from(self.table.uses[switch.brick]));
-            let more = self.table.active_squares(brick, coarser[brick])
-                - self.table.active_squares(brick, picks[brick]);
-            if squares + uses * more <= allowed {
-                squares += uses * more;
-                picks[brick] = coarser[brick];
+    fn spend_slack(&self, picks: &mut [Rung], allowed: f64, step: u32) -> io::Result<()> {
+        let coarser = self.picks(step.saturating_sub(SLACK_STEPS))?;
+        let (before, mut squares) = (picks.to_vec(), self.squares(picks)?);
+        for Switch { brick, squares: [coarse, fine], .. } in
+            switches(0, self, &coarser, &before)?.into_iter().rev()
+        {
+            let more = coarse - fine;
+            if squares + more <= allowed {
+                squares += more;
+                picks[brick as usize] = coarser[brick as usize];
             }
         }
-        if self.squares(picks) > allowed {
+        if self.squares(picks)? > allowed {
             picks.copy_from_slice(&before);
         }
+        Ok(())
     }
 
     /// Finds out which bricks had better borrow, were λ what it is at `step` and every brick coded as in `picks`. A brick
@@ -242,36 +239,39 @@ impl<'a> GridSearch<'a> {
         // Who is compared with whom does not change with every little more or less of λ: an edited frame leaves what
         // was found for the frames far from it as it is.
         let near = ((step + LENDING_STEPS / 2) / LENDING_STEPS * LENDING_STEPS).min(LAST_STEP);
-        let mut compared = self.picks(near);
+        let mut compared = self.picks(near)?;
         while self.try_unknown((0..).zip(compared.iter().copied()), advance)? {
-            compared = self.picks(near);
+            compared = self.picks(near)?;
         }
         // Who may borrow, and of those who has texels that others can use.
         let whole: Vec<bool> = (0..picks.len() as u32).map(|id| self.encodings.is_whole(id)).collect();
         let borrows = |id: u32| whole[id as usize] && compared[id as usize] != Rung::Empty;
         let lends = |id: u32| borrows(id).then(|| KeptCodec::of(compared[id as usize].codec())).flatten();
         let (table, least_step) = (&self.table, &self.least_step);
-        let gain = |id: u32, loan: &Loan| {
-            let brick = id as usize;
-            let lambda = lambda(step.max(least_step[brick]));
-            let own = table.distortion(brick, picks[brick]) + lambda * table.bits(brick, picks[brick]);
-            let borrowed = table.in_peaks(loan.cost.norm) * f64::from(table.uses[brick]);
-            own - borrowed - lambda * table.bits(brick, Rung::Borrowed)
+        let gain = |id: u32, weighed: Weighed, loan: &Loan| {
+            let lambda = lambda(step.max(least_step[id as usize].into()));
+            let own = picks[id as usize];
+            let own = weighed.distortion(own) + lambda * weighed.bits(own);
+            own - weighed.borrowed(loan) - lambda * weighed.bits(Rung::Borrowed)
         };
         // A fifth of the bricks has an offer worth taking.
         let mut order: Vec<(f64, u32, Loan)> = Vec::new();
-        loans(&self.encodings, self.tree, borrows, lends, |id, loans| {
-            let as_compared = |loan: &&Loan| picks[loan.lender as usize] == compared[loan.lender as usize];
-            let offers = loans.iter().filter(as_compared).map(|loan| (gain(id, loan), id, *loan));
-            order.extend(offers.filter(|(gain, ..)| *gain > 0.0));
+        loans(&self.encodings, self.tree, borrows, lends, |ids, loans| {
+            for ((&id, choices), loans) in ids.iter().zip(&table.read(ids)?).zip(loans) {
+                let as_compared = |loan: &Loan| picks[loan.lender as usize] == compared[loan.lender as usize];
+                let weighed = table.weighed(id, choices);
+                let offers = loans.into_iter().filter(as_compared);
+                let offers = offers.map(|loan| (gain(id, weighed, &loan), id, loan));
+                order.extend(offers.filter(|(gain, ..)| *gain > 0.0));
+            }
+            Ok(())
         })?;
         order.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         for (_, id, loan) in order {
-            let (id, lender) = (id as usize, loan.lender as usize);
-            let table = &mut self.table;
-            if table.loan(id).is_none() && self.lends[id].is_none() && table.loan(lender).is_none() {
-                table.lend(id as u32, loan);
-                self.lends[lender] = Some(picks[lender]);
+            let (lender, table) = (loan.lender, &mut self.table);
+            if table.loan(id).is_none() && self.lends[id as usize].is_none() && table.loan(lender).is_none() {
+                table.lend(id, loan);
+                self.lends[lender as usize] = Some(picks[lender as usize]);
             }
         }
         Ok(())
@@ -283,7 +283,7 @@ impl<'a> GridSearch<'a> {
     }
 
     pub(super) fn within(&mut self, bound: f64, advance: &mut dyn FnMut(u64)) -> io::Result<Vec<Rung>> {
-        let all: Vec<u32> = (0..self.table.len() as u32).collect();
+        let all: Vec<u32> = (0..self.table.len()).collect();
         let fits = |cost: &Cost| cost.norm.is_finite() && f64::from(cost.max) <= bound;
         loop {
             let mut picks = Vec::with_capacity(all.len());
@@ -300,18 +300,29 @@ impl<'a> GridSearch<'a> {
     }
 
     /// The PSNR of all frames together.
-    pub(super) fn whole(&self, picks: &[Rung]) -> f64 {
-        self.psnr(self.active_voxels, self.squares(picks))
+    pub(super) fn whole(&self, picks: &[Rung]) -> io::Result<f64> {
+        Ok(self.psnr(self.active_voxels, self.squares(picks)?))
     }
 
-    /// That of the worst frame.
-    pub(super) fn worst_frame(&self, picks: &[Rung]) -> f64 {
-        let frames = self.tree.frames.iter().map(|frame| {
-            let square = |id: u32| self.table.active_squares(id as usize, picks[id as usize]);
-            self.psnr(frame.stats.active_leaf_voxels, self.tree.frame_bricks(frame).map(square).sum())
-        });
-        // Where there is no error, or no voxel to err, there is no worst.
-        frames.filter(|db| db.is_finite()).fold(f64::INFINITY, f64::min)
+    /// The squared error of one frame over active voxels.
+    fn frame_squares(&self, frame: &FrameTree, picks: &[Rung]) -> io::Result<f64> {
+        let bricks: Vec<u32> = self.tree.frame_bricks(frame).collect();
+        let choices = self.table.read(&bricks)?;
+        let square = |(&id, choices)| self.table.weighed(id, choices).active_squares(picks[id as usize]);
+        Ok(bricks.iter().zip(&choices).map(square).sum())
+    }
+
+    /// The PSNR of the worst frame.
+    pub(super) fn worst_frame(&self, picks: &[Rung]) -> io::Result<f64> {
+        let mut worst = f64::INFINITY;
+        for frame in &self.tree.frames {
+            let db = self.psnr(frame.stats.active_leaf_voxels, self.frame_squares(frame, picks)?);
+            // Where there is no error, or no voxel to err, there is no worst.
+            if db.is_finite() {
+                worst = worst.min(db);
+            }
+        }
+        Ok(worst)
     }
 
     /// Binds the bricks of every frame below `floor` to the step at which it would reach it alone, and at least to the
@@ -324,16 +335,15 @@ impl<'a> GridSearch<'a> {
         advance: &mut dyn FnMut(u64),
     ) -> io::Result<bool> {
         // All are judged before loans are called in for the sake of some.
-        let low: Vec<(usize, f64)> = (0..self.tree.frames.len())
-            .map(|f| (f, Self::allowance(self.tree.frames[f].stats.active_leaf_voxels, floor)))
-            .filter(|&(f, allowed)| {
-                let bricks = || self.tree.frame_bricks(&self.tree.frames[f]);
-                let squares: f64 =
-                    bricks().map(|id| self.table.active_squares(id as usize, picks[id as usize])).sum();
-                // What no step meets is met as nearly as the last one does.
-                squares > allowed && bricks().any(|id| self.least_step[id as usize] < LAST_STEP)
-            })
-            .collect();
+        let mut low: Vec<(usize, f64)> = Vec::new();
+        for (f, frame) in self.tree.frames.iter().enumerate() {
+            let allowed = Self::allowance(frame.stats.active_leaf_voxels, floor);
+            let rises = |id: u32| u32::from(self.least_step[id as usize]) < LAST_STEP;
+            // What no step meets is met as nearly as the last one does.
+            if self.frame_squares(frame, picks)? > allowed && self.tree.frame_bricks(frame).any(rises) {
+                low.push((f, allowed));
+            }
+        }
         for &(frame, allowed) in &low {
             let bricks: Vec<u32> = self.tree.frame_bricks(&self.tree.frames[frame]).collect();
             let mut unique = bricks.clone();
@@ -341,21 +351,24 @@ impl<'a> GridSearch<'a> {
             unique.dedup();
             self.call_in_loans(&unique);
             let step = loop {
+                let (choices, table) = (self.table.read(&bricks)?, &self.table);
+                let weighed =
+                    || bricks.iter().zip(&choices).map(|(&id, choices)| (id, table.weighed(id, choices)));
                 let squares = |step| -> f64 {
-                    bricks
-                        .iter()
-                        .map(|&id| self.table.active_squares(id as usize, self.pick(id as usize, step)))
-                        .sum()
+                    weighed().map(|(id, weighed)| weighed.active_squares(self.pick(id, weighed, step))).sum()
                 };
-                let step = first_step(|step| squares(step) <= allowed);
-                let picked: Vec<_> = unique.iter().map(|&id| (id, self.pick(id as usize, step))).collect();
+                let step = first_step(|step| Ok(squares(step) <= allowed))?;
+                let mut picked: Vec<_> =
+                    weighed().map(|(id, weighed)| (id, self.pick(id, weighed, step))).collect();
+                picked.sort_unstable_by_key(|(id, _)| *id);
+                picked.dedup_by_key(|(id, _)| *id);
                 if !self.try_unknown(picked.into_iter(), advance)? {
                     break step;
                 }
             };
             // Picks keep the error of all voxels small, floors are about that of active ones: a step may look enough
             // that is not.
-            let least = |id: &u32| self.least_step[*id as usize];
+            let least = |id: &u32| u32::from(self.least_step[*id as usize]);
             let grows = unique.iter().any(|id| step > least(id).max(current));
             let step = if grows {
                 step
@@ -364,7 +377,7 @@ impl<'a> GridSearch<'a> {
             };
             for id in unique {
                 let least = &mut self.least_step[id as usize];
-                *least = step.max(*least);
+                *least = (*least).max(step as u16);
             }
         }
         Ok(!low.is_empty())
@@ -393,7 +406,7 @@ impl<'a> GridSearch<'a> {
                     loans
                         .get(&id)
                         .filter(|_| rung == Rung::Borrowed)
-                        .map_or(costs[rung as usize].norm, |l| l.cost.norm),
+                        .map_or(costs[rung as usize].norm, |loan| loan.norm),
                 );
                 codings.push(match rung {
                     Rung::Empty | Rung::Borrowed => Coding::Empty,
@@ -429,43 +442,52 @@ impl<'a> GridSearch<'a> {
 }
 
 /// The first step, of 0 to [`LAST_STEP`], that meets what every finer one meets too; the last if none does.
-pub(super) fn first_step(meets: impl Fn(u32) -> bool) -> u32 {
+pub(super) fn first_step(mut meets: impl FnMut(u32) -> io::Result<bool>) -> io::Result<u32> {
     let (mut low, mut high) = (0, LAST_STEP);
     while low < high {
         let middle = (low + high) / 2;
-        if meets(middle) {
+        if meets(middle)? {
             high = middle;
         } else {
             low = middle + 1;
         }
     }
-    low
+    Ok(low)
 }
 
 /// One brick's move to a finer codec.
 pub(super) struct Switch {
-    pub grid: usize,
-    pub brick: usize,
-    pub to: Rung,
+    pub grid: u32,
+    pub brick: u32,
     /// Squared peaks less for each bit more.
     pub gain: f64,
+    /// Its squared error over active voxels of all frames, before and after.
+    squares: [f64; 2],
 }
 
 /// The bricks in which two steps of a grid differ, most gain for a bit first.
-pub(super) fn switches(grid: usize, search: &GridSearch, coarse: &[Rung], fine: &[Rung]) -> Vec<Switch> {
-    let differ = (0..coarse.len()).filter(|&brick| coarse[brick] != fine[brick]);
-    let mut switches: Vec<Switch> = differ
-        .map(|brick| {
-            let (from, to) = (coarse[brick], fine[brick]);
-            let less = search.table.distortion(brick, from) - search.table.distortion(brick, to);
-            Switch {
+pub(super) fn switches(
+    grid: u32,
+    search: &GridSearch,
+    coarse: &[Rung],
+    fine: &[Rung],
+) -> io::Result<Vec<Switch>> {
+    let differ: Vec<u32> =
+        (0..).zip(coarse.iter().zip(fine)).filter(|(_, (a, b))| a != b).map(|(id, _)| id).collect();
+    let mut switches = Vec::with_capacity(differ.len());
+    for ids in differ.chunks(BRICKS_IN_FLIGHT as usize) {
+        for (&brick, choices) in ids.iter().zip(&search.table.read(ids)?) {
+            let weighed = search.table.weighed(brick, choices);
+            let (from, to) = (coarse[brick as usize], fine[brick as usize]);
+            let less = weighed.distortion(from) - weighed.distortion(to);
+            switches.push(Switch {
                 grid,
                 brick,
-                to,
-                gain: less / (search.table.bits(brick, to) - search.table.bits(brick, from)),
-            }
-        })
-        .collect();
+                gain: less / (weighed.bits(to) - weighed.bits(from)),
+                squares: [from, to].map(|rung| weighed.uses() * weighed.active_squares(rung)),
+            });
+        }
+    }
     switches.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.brick.cmp(&b.brick)));
-    switches
+    Ok(switches)
 }

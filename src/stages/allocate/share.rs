@@ -43,8 +43,10 @@ pub(super) struct Loan {
     pub lender: u32,
     /// The range that suits them best.
     pub range: BrickRange,
-    /// What it does to the borrower.
-    pub cost: Cost,
+    /// What it does to the borrower: [`Cost::norm`],
+    pub norm: f64,
+    /// and [`Cost::active_norm`].
+    pub active_norm: f64,
 }
 
 /// A [`Loan`] by its lender's place among the lenders that were compared, and its range as a record has it.
@@ -72,13 +74,14 @@ struct Lender {
 /// of no more bricks in memory than those of a few frames.
 const BATCHES: usize = 32;
 
-/// Visits each brick that may borrow, ascending, with the nearest of those that lend, the closest first.
+/// Visits the bricks that may borrow, ascending and some at a time, each with the nearest of those that lend, the
+/// closest first.
 pub(super) fn loans(
     encodings: &Encodings,
     tree: &mut SequenceTree,
     borrows: impl Fn(u32) -> bool,
     lends: impl Fn(u32) -> Option<KeptCodec>,
-    mut visit: impl FnMut(u32, &[Loan]),
+    mut visit: impl FnMut(&[u32], Vec<Vec<Loan>>) -> io::Result<()>,
 ) -> io::Result<()> {
     let lenders = |ids: &Range<u32>| -> Vec<(u32, KeptCodec)> {
         ids.clone().filter_map(|id| Some((id, lends(id)?))).collect()
@@ -98,10 +101,14 @@ pub(super) fn loans(
         };
         let comparisons: Vec<Comparison> = window.iter().map(comparison).collect();
         if let Some(cache) = encodings.cache() {
-            cache.prefetch(comparisons.iter().filter_map(|comparison| comparison.key(encodings, tree)));
+            let keys = comparisons.iter().map(|comparison| comparison.key(encodings, tree));
+            let keys: Vec<Option<Key>> = keys.collect::<io::Result<_>>()?;
+            cache.prefetch(keys.into_iter().flatten());
         }
-        let known: Vec<(Option<Key>, Option<Offers>)> =
-            comparisons.par_iter().map(|comparison| comparison.known(encodings, tree)).collect();
+        let known: Vec<(Option<Key>, Option<Offers>)> = comparisons
+            .par_iter()
+            .map(|comparison| comparison.known(encodings, tree))
+            .collect::<io::Result<_>>()?;
         for (comparison, (key, known)) in comparisons.iter().zip(known) {
             crate::interrupt::check()?;
             let offers = match known {
@@ -119,11 +126,11 @@ pub(super) fn loans(
             let loan = |offer: Offer| Loan {
                 lender: comparison.lenders[offer.lender as usize].0,
                 range: BrickRange::from_word(offer.range),
-                cost: offer.cost,
+                norm: offer.cost.norm,
+                active_norm: offer.cost.active_norm,
             };
-            for (&id, offers) in comparison.borrowers.iter().zip(offers) {
-                visit(id, &offers.into_iter().map(loan).collect::<Vec<_>>());
-            }
+            let loans = offers.into_iter().map(|offers| offers.into_iter().map(loan).collect());
+            visit(&comparison.borrowers, loans.collect())?;
         }
     }
     Ok(())
@@ -140,8 +147,8 @@ struct Comparison {
 
 impl Comparison {
     /// What stands for the offers in the cache, and those that are there.
-    fn known(&self, encodings: &Encodings, tree: &SequenceTree) -> (Option<Key>, Option<Offers>) {
-        let key = self.key(encodings, tree);
+    fn known(&self, encodings: &Encodings, tree: &SequenceTree) -> io::Result<(Option<Key>, Option<Offers>)> {
+        let key = self.key(encodings, tree)?;
         let is_sound = |offers: &Offers| {
             offers.len() == self.borrowers.len()
                 && offers.iter().flatten().all(|offer| {
@@ -149,21 +156,23 @@ impl Comparison {
                     (offer.lender as usize) < self.lenders.len() && extent.is_finite() && extent > f16::ZERO
                 })
         };
-        (key, key.and_then(|key| encodings.cache()?.get(&key)).filter(is_sound))
+        Ok((key, key.and_then(|key| encodings.cache()?.get(&key)).filter(is_sound)))
     }
 
     /// What the offers depend on; `None` where nothing is cached.
-    fn key(&self, encodings: &Encodings, tree: &SequenceTree) -> Option<Key> {
+    fn key(&self, encodings: &Encodings, tree: &SequenceTree) -> io::Result<Option<Key>> {
         let batches = &encodings.batches()[self.around.clone()];
         let keys: Option<Vec<[u8; 32]>> = batches.iter().map(|b| b.base.map(|key| *key.digest())).collect();
-        let place = |id: u32| tree.pool.home(id).brick;
+        let Some(keys) = keys else { return Ok(None) };
+        let place = |id: u32| tree.pool.place(id);
+        let actives = tree.pool.active_hashes(&self.borrowers)?;
         let borrowers: Vec<(u32, u64)> =
-            self.borrowers.iter().map(|&id| (place(id), tree.pool.active_hash(id))).collect();
+            self.borrowers.iter().zip(actives).map(|(&id, active)| (place(id), active)).collect();
         // Places are told from each other by the batch that they are in.
         let counts: Vec<usize> = batches.iter().map(|batch| count(&self.lenders, &batch.ids)).collect();
         let lenders: Vec<(u32, KeptCodec)> =
             self.lenders.iter().map(|&(id, codec)| (place(id), codec)).collect();
-        Some(Key::new(&STAGE, &(keys?, self.batch - self.around.start, borrowers, counts, lenders)))
+        Ok(Some(Key::new(&STAGE, &(keys, self.batch - self.around.start, borrowers, counts, lenders))))
     }
 }
 

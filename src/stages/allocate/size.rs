@@ -25,14 +25,15 @@ pub(super) fn at_size(
         None => floors_at_size(searches, limit, fixed, advance)?,
     };
     let (step, alone) = at_size_above(searches, limit, fixed, &floors, advance)?;
-    let squares = |searches: &[GridSearch], picks: &[Vec<Rung>]| -> f64 {
+    let squares = |searches: &[GridSearch], picks: &[Vec<Rung>]| -> io::Result<f64> {
         searches.iter().zip(picks).map(|(s, picks)| s.squares(picks)).sum()
     };
     for (search, picks) in searches.iter_mut().zip(&alone) {
         search.find_loans(picks, step, advance)?;
     }
     let (_, together) = at_size_above(searches, limit, fixed, &floors, advance)?;
-    if squares(searches, &together) < squares(searches, &alone) && bytes(searches, &together, fixed) <= limit
+    if squares(searches, &together)? < squares(searches, &alone)?
+        && bytes(searches, &together, fixed) <= limit
     {
         return Ok(together);
     }
@@ -54,23 +55,25 @@ fn floors_at_size(
 ) -> io::Result<Vec<f64>> {
     let none = vec![f64::NEG_INFINITY; searches.len()];
     let (_, free) = at_size_above(searches, limit, fixed, &none, advance)?;
-    let ends: Vec<(f64, f64)> =
-        searches.iter().zip(&free).map(|(s, p)| (s.worst_frame(p), s.whole(p) - FRAME_MARGIN_DB)).collect();
+    let end = |(s, p): (&GridSearch, &Vec<Rung>)| Ok((s.worst_frame(p)?, s.whole(p)? - FRAME_MARGIN_DB));
+    let ends = |searches: &[GridSearch], picks: &[Vec<Rung>]| -> io::Result<Vec<(f64, f64)>> {
+        searches.iter().zip(picks).map(end).collect()
+    };
+    let free = ends(searches, &free)?;
     // A grid without error has no worst frame and no PSNR: neither is below the other.
     let is_low = |(worst, wanted): &(f64, f64)| worst < wanted;
-    if !ends.iter().any(is_low) {
+    if !free.iter().any(is_low) {
         return Ok(none);
     }
     let floors = |part: f64| -> Vec<f64> {
         let between = |&(worst, wanted): &(f64, f64)| worst + part * (wanted - worst);
-        ends.iter().map(|e| if is_low(e) { between(e) } else { f64::NEG_INFINITY }).collect()
+        free.iter().map(|e| if is_low(e) { between(e) } else { f64::NEG_INFINITY }).collect()
     };
     let (mut low, mut high, mut best, mut best_is_even) = (0.0, 1.0, none, false);
     for _ in 0..FLOOR_HALVINGS {
         let middle = f64::midpoint(low, high);
         let (_, picks) = at_size_above(searches, limit, fixed, &floors(middle), advance)?;
-        let uneven = |(s, p): (&GridSearch, &Vec<Rung>)| s.worst_frame(p) < s.whole(p) - FRAME_MARGIN_DB;
-        let is_even = !searches.iter().zip(&picks).any(uneven);
+        let is_even = !ends(searches, &picks)?.iter().any(is_low);
         let fits = bytes(searches, &picks, fixed) <= limit;
         // The lowest floor that evens frames out, or else the highest that fits.
         if fits && (is_even || !best_is_even) {
@@ -90,32 +93,36 @@ fn at_size_above(
     floors: &[f64],
     advance: &mut dyn FnMut(u64),
 ) -> io::Result<(u32, Vec<Vec<Rung>>)> {
-    let all = |searches: &[GridSearch], step| searches.iter().map(|s| s.picks(step)).collect::<Vec<_>>();
+    let all = |searches: &[GridSearch], step| -> io::Result<Vec<Vec<Rung>>> {
+        searches.iter().map(|s| s.picks(step)).collect()
+    };
     searches.iter_mut().for_each(|s| s.least_step.fill(0));
     loop {
         // The first step that is too large: the one before is the last that fits.
-        let too_large = first_step(|step| bytes(searches, &all(searches, step), fixed) > limit);
+        let too_large = first_step(|step| Ok(bytes(searches, &all(searches, step)?, fixed) > limit))?;
         let fits = too_large.saturating_sub(1);
         let mut unknown = false;
         for step in [fits, too_large] {
             for search in searches.iter_mut() {
-                let picks = search.picks(step);
+                let picks = search.picks(step)?;
                 unknown |= search.try_unknown((0..).zip(picks), advance)?;
             }
         }
         if unknown {
             continue;
         }
-        let fine = all(searches, too_large);
-        let picks = if bytes(searches, &fine, fixed) <= limit { fine.clone() } else { all(searches, fits) };
+        let fine = all(searches, too_large)?;
+        let picks = if bytes(searches, &fine, fixed) <= limit { fine.clone() } else { all(searches, fits)? };
         let mut order: Vec<Switch> = Vec::new();
-        for (g, (search, (coarse, fine))) in searches.iter().zip(picks.iter().zip(&fine)).enumerate() {
-            order.extend(switches(g, search, coarse, fine));
+        for (g, (search, (coarse, fine))) in (0..).zip(searches.iter().zip(picks.iter().zip(&fine))) {
+            order.extend(switches(g, search, coarse, fine)?);
         }
         order.sort_by(|a, b| b.gain.total_cmp(&a.gain));
         let moved = |count: usize| {
             let mut picks = picks.clone();
-            order[..count].iter().for_each(|switch| picks[switch.grid][switch.brick] = switch.to);
+            for &Switch { grid, brick, .. } in &order[..count] {
+                picks[grid as usize][brick as usize] = fine[grid as usize][brick as usize];
+            }
             picks
         };
         let (mut low, mut high) = (0, order.len());
@@ -155,15 +162,14 @@ fn texel_bytes(counts: &[u32; Rung::ALL.len()]) -> u64 {
 /// What empty bricks do without: their records, and nodes of which nothing is left.
 fn saved_bytes(searches: &[GridSearch], picks: &[Vec<Rung>]) -> u64 {
     let of_grid = |(search, picks): (&GridSearch, &Vec<Rung>)| {
-        let empty = picks.iter().zip(&search.table.records).filter(|(rung, _)| **rung == Rung::Empty);
-        let records: u64 = empty.map(|(_, records)| u64::from(*records) * u64::from(RECORD_BITS / 8)).sum();
         let tree = &*search.tree;
         let is_empty = |&record: &u32| match tree.record(record).payload() {
             Payload::Brick(id) => picks[id as usize] == Rung::Empty,
             Payload::Constant(_) => false,
         };
+        let records = tree.runs.items().iter().filter(|entry| is_empty(entry)).count() as u64;
         let nodes = tree.nodes.items().iter().filter(|node| node.entries(&tree.runs).iter().all(is_empty));
-        records + nodes.count() as u64 * NODE_WORDS as u64 * 4
+        records * u64::from(RECORD_BITS / 8) + nodes.count() as u64 * NODE_WORDS as u64 * 4
     };
     searches.iter().zip(picks).map(of_grid).sum()
 }

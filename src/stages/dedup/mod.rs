@@ -14,7 +14,7 @@ use rayon::prelude::*;
 
 use crate::error::Error;
 use crate::volume::{
-    Brick, BrickPool, CellContent, Child, Constant, Coord, FrameStats, Home, InactiveRule, Interner, Mask512,
+    Brick, BrickPool, CellContent, Child, Constant, Coord, FrameStats, InactiveRule, Interner, List, Mask512,
     ValueRange, bits,
 };
 
@@ -31,18 +31,18 @@ pub struct SequenceTree {
     /// Runs of entries that [`SequenceTree::record`] understands, one run a distinct list of children.
     pub runs: Interner<u32>,
     /// The distinct L3 records of which more is to be said than which brick they are.
-    records: Vec<Record>,
+    records: List<Record>,
     /// The distinct masks. A mask of signs follows the mask it belongs to.
     pub masks: Interner<Mask512>,
     /// The distinct bricks.
     pub pool: BrickPool,
     /// For each brick of the pool, the range of the values that its texels carry.
-    pub brick_ranges: Vec<ValueRange>,
+    pub brick_ranges: List<ValueRange>,
     /// For each frame, the bricks of the pool that it had first.
     pub own_bricks: Vec<Range<u32>>,
     /// Gives the voxels of a frame that was added without.
     fetch: Option<Box<Fetch>>,
-    record_of_brick: Vec<u32>,
+    record_of_brick: List<u32>,
     record_of_constant: HashMap<(u32, Option<u32>, InactiveRule), u32>,
 }
 
@@ -161,7 +161,7 @@ impl SequenceTree {
     /// The record of an entry of [`SequenceTree::runs`].
     pub fn record(&self, entry: u32) -> Record {
         match entry & PLAIN_BRICK {
-            0 => self.records[entry as usize],
+            0 => self.records[entry],
             _ => Record::new(None, InactiveRule::Texel, Payload::Brick(entry & !PLAIN_BRICK)),
         }
     }
@@ -174,13 +174,13 @@ impl SequenceTree {
             frames: Vec::new(),
             nodes: Interner::default(),
             runs: Interner::default(),
-            records: Vec::new(),
+            records: List::default(),
             masks: Interner::default(),
             pool: BrickPool::default(),
-            brick_ranges: Vec::new(),
+            brick_ranges: List::default(),
             own_bricks: Vec::new(),
             fetch,
-            record_of_brick: Vec::new(),
+            record_of_brick: List::default(),
             record_of_constant: HashMap::new(),
         }
     }
@@ -190,10 +190,8 @@ impl SequenceTree {
     /// # Errors
     /// When the scratch file cannot be written.
     pub fn seal(&mut self) -> io::Result<()> {
-        self.record_of_brick = Vec::new();
+        self.record_of_brick = List::default();
         self.record_of_constant = HashMap::new();
-        self.records.shrink_to_fit();
-        self.brick_ranges.shrink_to_fit();
         self.nodes.seal();
         self.runs.seal();
         self.masks.seal();
@@ -240,7 +238,7 @@ impl SequenceTree {
     fn put_voxels(&mut self, frame: usize, voxels: &[Brick]) -> io::Result<()> {
         for id in self.own_bricks[frame].clone() {
             if !self.pool.is_there(id) {
-                self.pool.put(id, &voxels[self.pool.home(id).brick as usize].values)?;
+                self.pool.put(id, &voxels[self.pool.place(id) as usize].values)?;
             }
         }
         Ok(())
@@ -252,7 +250,7 @@ impl SequenceTree {
         let digests = self.pool.digests(&own)?;
         let pool = &self.pool;
         let is_told = |(&id, digest): (&u32, &[u8; 32])| {
-            voxels.get(pool.home(id).brick as usize).is_some_and(|brick| {
+            voxels.get(pool.place(id) as usize).is_some_and(|brick| {
                 let brick = Brick { keeps_mask: pool.keeps_mask(id), ..brick.clone() };
                 BrickPool::digest(&brick) == *digest
             })
@@ -268,9 +266,9 @@ impl SequenceTree {
     /// # Errors
     /// When a frame cannot be read or the scratch file not be written.
     pub fn fetch(&mut self, ids: &[u32]) -> io::Result<()> {
-        let absent = ids.iter().filter(|&&id| !self.pool.is_there(id)).map(|&id| self.pool.home(id).frame);
-        let absent: BTreeSet<u32> = absent.collect();
-        let absent: Vec<usize> = absent.into_iter().map(|frame| frame as usize).collect();
+        let frame = |id: &u32| self.own_bricks.partition_point(|own| own.end <= *id);
+        let absent: BTreeSet<usize> = ids.iter().filter(|&&id| !self.pool.is_there(id)).map(frame).collect();
+        let absent: Vec<usize> = absent.into_iter().collect();
         for frames in absent.chunks(rayon::current_num_threads()) {
             let fetch =
                 self.fetch.as_ref().expect("frames without voxels are added with a way to fetch them");
@@ -322,10 +320,9 @@ impl SequenceTree {
             }
             Values::Varied(range, digest) => (range, digest),
         };
-        let home = Home { frame: self.frames.len() as u32, brick: place };
-        let (id, is_new) = self.pool.insert(&digest, active, keeps_mask, home)?;
+        let (id, is_new) = self.pool.insert(&digest, active, keeps_mask, place)?;
         if !is_new {
-            return Ok(self.record_of_brick[id as usize]);
+            return Ok(self.record_of_brick[id]);
         }
         let mask = self.mask(outline);
         let record = match (mask, rule) {
@@ -350,7 +347,7 @@ impl SequenceTree {
     /// The inactive rule of each brick of the pool.
     pub fn brick_rules(&self) -> Vec<InactiveRule> {
         let mut rules = vec![InactiveRule::Texel; self.pool.len() as usize];
-        for record in &self.records {
+        for record in self.records.iter() {
             if let Payload::Brick(id) = record.payload() {
                 rules[id as usize] = record.rule;
             }

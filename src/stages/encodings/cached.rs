@@ -112,22 +112,24 @@ impl Batch {
         self.base.map(|base| Key::new(&stage, &(base.digest(), kind)))
     }
 
-    fn find(&self, tree: &SequenceTree, cache: &Cache, kind: Kind) -> Option<Found> {
-        let all = cache.get::<Entry>(&self.key(kind)?).filter(|entry| entry.is_sound(kind))?;
+    fn find(&self, tree: &SequenceTree, cache: &Cache, kind: Kind) -> io::Result<Option<Found>> {
+        let entry = self.key(kind).and_then(|key| cache.get::<Entry>(&key));
+        let Some(all) = entry.filter(|entry| entry.is_sound(kind)) else { return Ok(None) };
+        let wanted: Vec<u32> = self.ids.clone().collect();
         let (mut ids, mut places) = (Vec::new(), Vec::new());
-        for id in self.ids.clone() {
-            let found = all.places.binary_search(&tree.pool.home(id).brick).ok();
-            if let Some(i) = found.filter(|&i| all.actives[i] == tree.pool.active_hash(id)) {
+        for (&id, active) in wanted.iter().zip(tree.pool.active_hashes(&wanted)?) {
+            let found = all.places.binary_search(&tree.pool.place(id)).ok();
+            if let Some(i) = found.filter(|&i| all.actives[i] == active) {
                 ids.push(id);
                 places.push(i);
             }
         }
         if places.len() == all.places.len() {
-            return Some(Found { kind, ids, entry: all });
+            return Ok(Some(Found { kind, ids, entry: all }));
         }
         let mut entry = Entry::default();
         places.into_iter().for_each(|i| entry.push_from(&all, i, kind.size()));
-        Some(Found { kind, ids, entry })
+        Ok(Some(Found { kind, ids, entry }))
     }
 }
 
@@ -141,7 +143,7 @@ impl Batches {
         let mut all = Vec::new();
         for (frame, own) in tree.own_bricks.iter().enumerate() {
             let own: Vec<u32> = own.clone().collect();
-            let part = |id: &u32| tree.pool.home(*id).brick / BATCH_BRICKS;
+            let part = |id: &u32| tree.pool.place(*id) / BATCH_BRICKS;
             for ids in own.chunk_by(|a, b| part(a) == part(b)) {
                 let base = cache.as_ref().map(|cache| {
                     let outline = cache.frames[frame].digest();
@@ -238,11 +240,11 @@ impl Encodings {
         for wanted in wanted.chunks(64) {
             let batches = &self.batches.all;
             cache.prefetch(wanted.iter().filter_map(|&(batch, kind)| batches[batch].key(kind)));
-            let found: Vec<Found> = wanted
+            let found: Vec<Option<Found>> = wanted
                 .par_iter()
-                .filter_map(|&(batch, kind)| batches[batch].find(tree, &cache, kind))
-                .collect();
-            for Found { kind, ids, entry } in found {
+                .map(|&(batch, kind)| batches[batch].find(tree, &cache, kind))
+                .collect::<io::Result<_>>()?;
+            for Found { kind, ids, entry } in found.into_iter().flatten() {
                 self.keep(&ids, entry.into_made(kind))?;
             }
         }
@@ -276,8 +278,8 @@ impl Encodings {
 
     fn entry(&self, tree: &SequenceTree, ids: &[u32], kind: Kind) -> io::Result<Entry> {
         let mut entry = Entry {
-            places: ids.iter().map(|&id| tree.pool.home(id).brick).collect(),
-            actives: ids.iter().map(|&id| tree.pool.active_hash(id)).collect(),
+            places: ids.iter().map(|&id| tree.pool.place(id)).collect(),
+            actives: tree.pool.active_hashes(ids)?,
             ..Entry::default()
         };
         match kind {

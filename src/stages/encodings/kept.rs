@@ -4,8 +4,8 @@ use std::io;
 
 use bytemuck::{Pod, Zeroable};
 
-use super::Cost;
-use crate::volume::Scratch;
+use super::{Cost, KeptCodec, Kind};
+use crate::volume::{SCRATCH_HEAD, Scratch};
 
 /// A [`Cost`], and something more of what it is the cost of.
 #[derive(Clone, Copy, Pod, Zeroable)]
@@ -29,40 +29,88 @@ impl Note {
 
 /// One kind of result for the bricks of a pool, each once: `N` notes a brick, and texels.
 pub(super) struct Kept<const N: usize> {
-    /// By brick of the pool: its place among those that are kept. They lie in the order in which they came, since BC7
-    /// is kept for some bricks of a frame only, and writes with gaps between them are slow.
-    places: Vec<u32>,
-    /// How many are kept.
-    count: u32,
+    places: Places,
     notes: Scratch,
     texels: Option<Scratch>,
 }
 
+/// Where the results of each brick lie, as far as there are any. None are kept of a kind that nobody asks for.
+enum Places {
+    /// At the brick's number; whether they do.
+    Own(Vec<bool>),
+    /// In the order in which they came, for a kind that is made for some bricks of a frame only: writes with gaps
+    /// between them are slow.
+    Made {
+        /// By brick.
+        places: Vec<u32>,
+        /// How many there are.
+        count: u32,
+    },
+}
+
 const NOWHERE: u32 = u32::MAX;
 
+impl Places {
+    fn new(kind: Kind) -> Self {
+        match kind {
+            Kind::Texels(KeptCodec::Bc7) => Self::Made { places: Vec::new(), count: 0 },
+            _ => Self::Own(Vec::new()),
+        }
+    }
+
+    fn is_known(&self, id: u32) -> bool {
+        match self {
+            Self::Own(known) => known.get(id as usize).is_some_and(|known| *known),
+            Self::Made { places, .. } => places.get(id as usize).is_some_and(|&place| place != NOWHERE),
+        }
+    }
+
+    /// Where a brick's lie that are there.
+    fn of(&self, id: u32) -> u32 {
+        match self {
+            Self::Own(_) => id,
+            Self::Made { places, .. } => places[id as usize],
+        }
+    }
+
+    /// Where a brick's shall lie, of a pool of `bricks`.
+    fn take(&mut self, bricks: usize, id: u32) -> u32 {
+        match self {
+            Self::Own(known) => {
+                known.resize(bricks, false);
+                known[id as usize] = true;
+                id
+            }
+            Self::Made { places, count } => {
+                places.resize(bricks, NOWHERE);
+                places[id as usize] = *count;
+                *count += 1;
+                *count - 1
+            }
+        }
+    }
+}
+
 impl<const N: usize> Kept<N> {
-    /// Nothing yet, of a pool of that many bricks, with that many bytes of texels each.
-    pub fn new(texels: usize) -> Self {
-        let texels = (texels > 0).then(|| Scratch::new(texels));
-        Self { places: Vec::new(), count: 0, notes: Scratch::new(N * size_of::<Note>()), texels }
+    /// Nothing yet of a kind, with that many bytes of texels each.
+    pub fn new(kind: Kind, texels: usize) -> Self {
+        let texels = (texels > 0).then(|| Scratch::new(texels, 0));
+        Self { places: Places::new(kind), notes: Scratch::new(N * size_of::<Note>(), SCRATCH_HEAD), texels }
     }
 
     pub fn is_known(&self, id: u32) -> bool {
-        self.places.get(id as usize).is_some_and(|&place| place != NOWHERE)
+        self.places.is_known(id)
     }
 
     /// Keeps what was made of some bricks of a pool of `bricks`.
     pub fn add(&mut self, bricks: usize, ids: &[u32], notes: &[[Note; N]], texels: &[u8]) -> io::Result<()> {
-        // None are kept of a kind that nobody asks for.
-        self.places.resize(bricks, NOWHERE);
-        for (&id, place) in ids.iter().zip(self.count..) {
-            self.places[id as usize] = place;
+        for (i, (&id, notes)) in ids.iter().zip(notes).enumerate() {
+            let place = self.places.take(bricks, id);
+            self.notes.put(place, bytemuck::cast_slice(notes))?;
+            if let Some(scratch) = &mut self.texels {
+                scratch.put(place, &texels[i * scratch.record()..][..scratch.record()])?;
+            }
         }
-        self.notes.put(self.count, bytemuck::cast_slice(notes.as_flattened()))?;
-        if let Some(scratch) = &mut self.texels {
-            scratch.put(self.count, texels)?;
-        }
-        self.count += ids.len() as u32;
         Ok(())
     }
 
@@ -73,7 +121,7 @@ impl<const N: usize> Kept<N> {
     }
 
     fn places(&self, ids: &[u32]) -> Vec<u32> {
-        ids.iter().map(|&id| self.places[id as usize]).collect()
+        ids.iter().map(|&id| self.places.of(id)).collect()
     }
 
     /// The notes of bricks that are known.

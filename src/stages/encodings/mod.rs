@@ -161,8 +161,8 @@ impl Encodings {
         let batches = Batches::new(tree, cache, &sequence, &terms);
         Some(Self {
             rules: tree.brick_rules(),
-            plain: Kept::new(0),
-            kept: KeptCodec::ALL.map(|codec| Kept::new(codec.brick_bytes())),
+            plain: Kept::new(Kind::Plain, 0),
+            kept: KeptCodec::ALL.map(|codec| Kept::new(Kind::Texels(codec), codec.brick_bytes())),
             batches,
             saved: Instant::now(),
             sequence,
@@ -205,7 +205,7 @@ impl Encodings {
         match self.terms.range {
             RangeMode::Sequence => BrickRange::SEQUENCE,
             RangeMode::Brick => {
-                let values = tree.brick_ranges[id as usize];
+                let values = tree.brick_ranges[id];
                 self.sequence.fit(values.min, values.max)
             }
         }
@@ -218,7 +218,7 @@ impl Encodings {
 
     /// A brick as its texels shall be.
     pub fn prepare(&self, tree: &SequenceTree, id: u32, brick: &Brick) -> Texels {
-        let (rule, range) = (self.rules[id as usize], tree.brick_ranges[id as usize]);
+        let (rule, range) = (self.rules[id as usize], tree.brick_ranges[id]);
         Texels::new(brick, carried(&brick.active, rule), (range.min, range.max), self.range(tree, id))
     }
 
@@ -289,7 +289,7 @@ impl Encodings {
     }
 
     fn make_plain(&self, tree: &SequenceTree, id: u32, brick: &Brick, texels: &Texels) -> Plain {
-        let range = tree.brick_ranges[id as usize];
+        let range = tree.brick_ranges[id];
         let value = match self.terms.aim {
             ConstantAim::Squares => measure::mean(brick, &texels.carried),
             ConstantAim::Max => f64::midpoint(range.min.into(), range.max.into()) as f32,
