@@ -9,6 +9,7 @@ use super::dedup::SequenceTree;
 use super::encodings::{KeptCodec, Kind, Tried};
 use super::relayout::{self, PlannedAtlas, Texture, TextureOf};
 use crate::codec::{Codec, OutOfRange, Texels, decode, encode};
+use crate::pack::Atlas;
 use crate::trace;
 use crate::volume::Brick;
 
@@ -55,14 +56,6 @@ impl Outcome {
     }
 }
 
-/// The contents of some slots before they are encoded.
-enum Run {
-    /// One slot's texels, which are there already.
-    Encoded(Encoded),
-    /// Bricks of one grid, by their numbers in its pool.
-    Bricks(Vec<u32>),
-}
-
 /// One brick's texels, encoded.
 struct Encoded {
     bytes: Vec<u8>,
@@ -71,44 +64,55 @@ struct Encoded {
     norm: Option<f64>,
 }
 
-/// Encodes every slab of an atlas in order. `finish` is applied to a slab's bytes on the thread that made
-/// them, `sink` to the results in order. What becomes of each grid's bricks goes into `outcomes`.
+/// A slab of an atlas, and what lies in it.
+struct Slab<'a> {
+    atlas: &'a Atlas,
+    place: u32,
+    textures: Vec<Texture>,
+}
+
+/// Encodes every slab of every atlas in order. `finish` is applied to a slab's bytes on the thread that made
+/// them, `sink` to the results in order, each with its atlas and its place there. What becomes of each grid's bricks
+/// goes into `outcomes`.
 ///
 /// # Errors
 /// [`QuantiseError`].
 pub fn quantise<T: Send>(
-    planned: &PlannedAtlas,
+    atlases: &[PlannedAtlas],
     grids: &mut [GridBricks],
     outcomes: &mut [Outcome],
-    finish: impl Fn(Vec<u8>) -> io::Result<T> + Sync,
-    mut sink: impl FnMut(T) -> io::Result<()>,
+    finish: impl Fn(&Atlas, Vec<u8>) -> io::Result<T> + Sync,
+    mut sink: impl FnMut(&Atlas, u32, T) -> io::Result<()>,
 ) -> Result<(), QuantiseError> {
-    let atlas = &planned.atlas;
-    // Two slabs a thread: one of them may take longer than another.
-    let group = 2 * rayon::current_num_threads() as u32;
-    for first in (0..atlas.slabs).step_by(group as usize) {
+    let slabs = atlases.iter().flat_map(|planned| (0..planned.atlas.slabs).map(move |slab| (planned, slab)));
+    let mut slabs = slabs.map(|(planned, place)| {
+        let atlas = &planned.atlas;
+        Slab { atlas, place, textures: planned.textures(atlas.slots(place)) }
+    });
+    loop {
         crate::interrupt::check().map_err(io::Error::from)?;
-        let slabs: Vec<Vec<Texture>> = (first..(first + group).min(atlas.slabs))
-            .map(|slab| planned.textures(atlas.slots(slab)))
-            .collect();
-        make_kept(grids, atlas.codec, &slabs.concat())?;
-        let runs = slabs
-            .iter()
-            .map(|textures| read_runs(grids, atlas.codec, textures))
-            .collect::<io::Result<Vec<_>>>()?;
-        let grids = &*grids;
-        let encoded: Vec<_> = runs
-            .into_par_iter()
-            .map(|runs| {
+        // Two a thread: one of them may take longer than another.
+        let group: Vec<Slab> = slabs.by_ref().take(2 * rayon::current_num_threads()).collect();
+        if group.is_empty() {
+            return Ok(());
+        }
+        for slabs in group.chunk_by(|a, b| a.atlas.codec == b.atlas.codec) {
+            let textures: Vec<Texture> = slabs.iter().flat_map(|slab| &slab.textures).copied().collect();
+            prepare(grids, slabs[0].atlas.codec, &textures)?;
+        }
+        let shared = &*grids;
+        let encoded: Vec<_> = group
+            .par_iter()
+            .map(|slab| {
                 let _span = trace::span("quantise");
-                let encoded = encode_slab(atlas.codec, grids, runs)?;
+                let encoded = encode_slab(shared, slab)?;
                 let bytes: Vec<u8> = encoded.iter().flat_map(|e| &e.bytes).copied().collect();
-                Ok((finish(relayout::assemble(atlas, &bytes))?, encoded))
+                Ok((finish(slab.atlas, relayout::assemble(slab.atlas, &bytes))?, encoded))
             })
             .collect::<Result<_, QuantiseError>>()?;
-        for ((slab, encoded), textures) in encoded.into_iter().zip(&slabs) {
-            sink(slab)?;
-            for (texture, encoded) in textures.iter().zip(encoded) {
+        for ((bytes, encoded), slab) in encoded.into_iter().zip(&group) {
+            sink(slab.atlas, slab.place, bytes)?;
+            for (texture, encoded) in slab.textures.iter().zip(encoded) {
                 if let TextureOf::Brick(id) = texture.of {
                     let outcome = &mut outcomes[texture.grid as usize];
                     outcome.axes[id as usize] = encoded.axis;
@@ -117,75 +121,48 @@ pub fn quantise<T: Send>(
             }
         }
     }
-    Ok(())
 }
 
-/// Makes the texels of some slots that are kept and not there yet.
-fn make_kept(grids: &mut [GridBricks], codec: Codec, textures: &[Texture]) -> io::Result<()> {
-    let Some(kept) = KeptCodec::of(codec) else { return Ok(()) };
+/// Sees to it that the texels of some slots, which are kept, or else their bricks can be read.
+fn prepare(grids: &mut [GridBricks], codec: Codec, textures: &[Texture]) -> io::Result<()> {
     for (g, GridBricks { tree, allocation }) in grids.iter_mut().enumerate() {
-        let own = |texture: &Texture| match texture.of {
-            TextureOf::Brick(id) => (texture.grid as usize == g).then_some(id),
-            TextureOf::Shape(_) => None,
-        };
-        let ids: Vec<u32> = textures.iter().filter_map(own).collect();
-        allocation.encodings.make(tree, &ids, &[Kind::Texels(kept)], |_| ())?;
+        let own = textures.iter().filter(|texture| texture.grid as usize == g).filter_map(Texture::brick);
+        let ids: Vec<u32> = own.collect();
+        match KeptCodec::of(codec) {
+            Some(kept) => allocation.encodings.make(tree, &ids, &[Kind::Texels(kept)], |_| ())?,
+            None => tree.fetch(&ids)?,
+        }
     }
     Ok(())
 }
 
-/// What lies in some slots, each run with its grid: texels where they are known, else bricks.
-fn read_runs(grids: &mut [GridBricks], codec: Codec, textures: &[Texture]) -> io::Result<Vec<(usize, Run)>> {
-    let together = |a: &Texture, b: &Texture| {
-        a.grid == b.grid && matches!((a.of, b.of), (TextureOf::Brick(_), TextureOf::Brick(_)))
-    };
-    let mut runs = Vec::new();
-    for run in textures.chunk_by(together) {
-        let index = run[0].grid as usize;
-        let GridBricks { tree, allocation } = &mut grids[index];
+fn encode_slab(grids: &[GridBricks], slab: &Slab) -> Result<Vec<Encoded>, QuantiseError> {
+    let codec = slab.atlas.codec;
+    let together = |a: &Texture, b: &Texture| a.grid == b.grid && a.brick().is_some() && b.brick().is_some();
+    let mut out = Vec::with_capacity(slab.textures.len());
+    for run in slab.textures.chunk_by(together) {
+        let grid = run[0].grid as usize;
+        let GridBricks { tree, allocation } = &grids[grid];
         if let TextureOf::Shape(shape) = run[0].of {
             let shape = &allocation.shapes[shape as usize];
-            let encoded = Encoded { bytes: shape.bytes.clone(), axis: shape.axis, norm: None };
-            runs.push((index, Run::Encoded(encoded)));
+            out.push(Encoded { bytes: shape.bytes.clone(), axis: shape.axis, norm: None });
             continue;
         }
-        let id = |texture: &Texture| match texture.of {
-            TextureOf::Brick(id) => id,
-            TextureOf::Shape(_) => unreachable!("shapes are runs of their own"),
-        };
-        let ids: Vec<u32> = run.iter().map(id).collect();
+        let ids: Vec<u32> = run.iter().filter_map(Texture::brick).collect();
         match KeptCodec::of(codec) {
             Some(kept) => {
                 let Tried { costs, bytes, axes } = allocation.encodings.texels(&ids, kept)?;
                 let each = bytes.chunks_exact(codec.layout().brick_bytes()).zip(costs).zip(axes);
-                runs.extend(each.map(|((bytes, cost), axis)| {
-                    (index, Run::Encoded(Encoded { bytes: bytes.to_vec(), axis, norm: Some(cost.norm) }))
+                out.extend(each.map(|((bytes, cost), axis)| Encoded {
+                    bytes: bytes.to_vec(),
+                    axis,
+                    norm: Some(cost.norm),
                 }));
             }
             None => {
-                tree.fetch(&ids)?;
-                runs.push((index, Run::Bricks(ids)));
-            }
-        }
-    }
-    Ok(runs)
-}
-
-fn encode_slab(
-    codec: Codec,
-    grids: &[GridBricks],
-    runs: Vec<(usize, Run)>,
-) -> Result<Vec<Encoded>, QuantiseError> {
-    let mut out = Vec::new();
-    for (grid, run) in runs {
-        match run {
-            Run::Encoded(encoded) => out.push(encoded),
-            Run::Bricks(ids) => {
-                let bricks = grids[grid].tree.pool.read(&ids)?;
-                out.extend(
-                    encode_bricks(codec, &grids[grid], &ids, &bricks)
-                        .map_err(|source| QuantiseError::OutOfRange { grid, source })?,
-                );
+                let bricks = tree.pool.read(&ids)?;
+                let encoded = encode_bricks(codec, &grids[grid], &ids, &bricks);
+                out.extend(encoded.map_err(|source| QuantiseError::OutOfRange { grid, source })?);
             }
         }
     }

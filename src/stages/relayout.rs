@@ -50,6 +50,16 @@ pub struct Texture {
     pub of: TextureOf,
 }
 
+impl Texture {
+    /// The brick whose own they are, if they are a brick's.
+    pub fn brick(&self) -> Option<u32> {
+        match self.of {
+            TextureOf::Brick(id) => Some(id),
+            TextureOf::Shape(_) => None,
+        }
+    }
+}
+
 /// Whose texels lie in a slot.
 #[derive(Clone, Copy, Debug)]
 pub enum TextureOf {

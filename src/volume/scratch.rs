@@ -13,7 +13,7 @@ const BLOCK: usize = 128 << 10;
 const GAP: u64 = 16 << 10;
 
 /// What of small records stays in memory: those of some thousand bricks, which is a sequence of a second.
-pub const SCRATCH_HEAD: usize = 512 << 10;
+pub const SCRATCH_HEAD: usize = 256 << 10;
 
 /// Records by their places, which may be filled in any order; one after another is the quickest. The file is made with
 /// the first of them.

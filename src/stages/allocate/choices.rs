@@ -51,7 +51,7 @@ impl Choices {
 pub(super) struct Weighed<'a> {
     choices: &'a Choices,
     loan: Option<&'a Loan>,
-    peak: f64,
+    table: &'a Table,
 }
 
 impl Weighed<'_> {
@@ -71,13 +71,15 @@ impl Weighed<'_> {
 
     /// The same with some loan.
     pub fn borrowed(&self, loan: &Loan) -> f64 {
-        in_peaks(loan.norm, self.peak) * self.uses()
+        in_peaks(loan.norm, self.table.peak) * self.uses()
     }
 
     /// The error for one user, over active voxels.
     pub fn active_squares(&self, rung: Rung) -> f64 {
         match rung {
-            Rung::Borrowed => self.loan.map_or(f64::INFINITY, |loan| in_peaks(loan.active_norm, self.peak)),
+            Rung::Borrowed => {
+                self.loan.map_or(f64::INFINITY, |loan| in_peaks(loan.active_norm, self.table.peak))
+            }
             rung => rung.own().map_or(0.0, |i| self.choices.active_squares[i].into()),
         }
     }
@@ -85,7 +87,19 @@ impl Weighed<'_> {
     /// The bits of the texels and of all records.
     pub fn bits(&self, rung: Rung) -> f64 {
         let records = if rung == Rung::Empty { 0 } else { self.choices.records };
-        f64::from(rung.texel_bits()) + f64::from(RECORD_BITS) * f64::from(records)
+        self.table.texel_bits[rung as usize] + f64::from(RECORD_BITS) * f64::from(records)
+    }
+
+    /// The rung with the least D + λR; of equals the one of fewest bits.
+    pub fn best(&self, lambda: f64) -> Rung {
+        let (mut best, mut least) = (Rung::F32, f64::INFINITY);
+        for rung in Rung::ALL {
+            let cost = self.distortion(rung) + lambda * self.bits(rung);
+            if cost < least {
+                (best, least) = (rung, cost);
+            }
+        }
+        best
     }
 }
 
@@ -97,12 +111,14 @@ fn in_peaks(norm: f64, peak: f64) -> f64 {
 }
 
 /// Bricks that are looked at together: what a thread reads of the table at a time.
-const BLOCK: u32 = 2048;
+pub(super) const BLOCK: u32 = 1024;
 
 /// What every rung comes to for every brick. A long sequence's table is in scratch, and passes over it read it anew.
 pub(super) struct Table {
     /// Maximum less minimum of active values.
     pub peak: f64,
+    /// Of each rung; looked up more than anything else.
+    texel_bits: [f64; Rung::ALL.len()],
     bricks: u32,
     choices: Scratch,
     /// What bricks borrow, and which of them do.
@@ -114,7 +130,8 @@ impl Table {
     /// Of no brick yet.
     pub fn new(peak: f64) -> Self {
         let choices = Scratch::new(size_of::<Choices>(), SCRATCH_HEAD);
-        Self { peak, bricks: 0, choices, loans: HashMap::new(), has_loan: Vec::new() }
+        let texel_bits = Rung::ALL.map(|rung| rung.texel_bits().into());
+        Self { peak, texel_bits, bricks: 0, choices, loans: HashMap::new(), has_loan: Vec::new() }
     }
 
     /// Adds the next bricks, and what the rungs come to for them.
@@ -162,7 +179,7 @@ impl Table {
 
     /// What was noted of a brick and what it borrows.
     pub fn weighed<'a>(&'a self, id: u32, choices: &'a Choices) -> Weighed<'a> {
-        Weighed { choices, loan: self.loan(id), peak: self.peak }
+        Weighed { choices, loan: self.loan(id), table: self }
     }
 
     /// Looks at every brick, on all cores. Blocks come in order.

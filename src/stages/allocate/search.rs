@@ -10,14 +10,14 @@ use std::io;
 use std::sync::LazyLock;
 
 use super::adaptive::AdaptiveGrid;
-use super::choices::{Choices, Table, Weighed, costs};
+use super::choices::{BLOCK, Choices, Table, Weighed, costs};
 use super::rung::Rung;
 use super::share::{Loan, loans};
 use super::{Allocation, Coding, Shape};
 use crate::stages::dedup::{FrameTree, Payload, SequenceTree};
 use crate::stages::encodings::{Cost, Encodings, KeptCodec, Kind, Tried};
 use crate::trace;
-use crate::volume::{BRICKS_IN_FLIGHT, ValueRange};
+use crate::volume::ValueRange;
 
 /// A step is 1.1 % of λ, under 0.05 dB of PSNR.
 const STEPS_PER_OCTAVE: u32 = 64;
@@ -84,9 +84,8 @@ impl<'a> GridSearch<'a> {
             encodings: grid.encodings,
             tree,
         };
-        let all: Vec<u32> = (0..uses.len() as u32).collect();
-        for ids in all.chunks(BRICKS_IN_FLIGHT as usize) {
-            let costs = costs(&search.encodings, ids, &search.bc7_is_tried)?;
+        for ids in windows(uses.len() as u32) {
+            let costs = costs(&search.encodings, &ids, &search.bc7_is_tried)?;
             let choices = |&id: &u32| Choices::new(uses[id as usize], records[id as usize]);
             search.table.add(ids.iter().map(choices).zip(costs.into_iter().map(|(costs, _)| costs)))?;
         }
@@ -104,7 +103,7 @@ impl<'a> GridSearch<'a> {
         10.0 * (voxels / squares).log10()
     }
 
-    /// The rung with the least D + λR; of equals the cheapest.
+    /// The rung that a brick gets at a step.
     fn pick(&self, id: u32, weighed: Weighed, step: u32) -> Rung {
         if let Some(rung) = self.lends[id as usize] {
             return rung;
@@ -115,15 +114,7 @@ impl<'a> GridSearch<'a> {
             let possible = |rung: &Rung| weighed.distortion(*rung).is_finite();
             return Rung::ALL.into_iter().find(possible).unwrap_or(Rung::F32);
         }
-        let lambda = lambda(step);
-        let (mut best, mut least) = (Rung::F32, f64::INFINITY);
-        for rung in Rung::ALL {
-            let cost = weighed.distortion(rung) + lambda * weighed.bits(rung);
-            if cost < least {
-                (best, least) = (rung, cost);
-            }
-        }
-        best
+        weighed.best(lambda(step))
     }
 
     pub(super) fn picks(&self, step: u32) -> io::Result<Vec<Rung>> {
@@ -149,7 +140,7 @@ impl<'a> GridSearch<'a> {
         let unknown = picks.filter(|&(id, rung)| rung == Rung::Bc7 && !self.bc7_is_tried[id as usize]);
         let unknown: Vec<u32> = unknown.map(|(id, _)| id).collect();
         self.encodings.make(self.tree, &unknown, &[Kind::Texels(KeptCodec::Bc7)], advance)?;
-        for ids in unknown.chunks(BRICKS_IN_FLIGHT as usize) {
+        for ids in unknown.chunks(BLOCK as usize) {
             self.table.weigh(ids, Rung::Bc7, &self.encodings.costs(ids, KeptCodec::Bc7)?)?;
             ids.iter().for_each(|&id| self.bc7_is_tried[id as usize] = true);
         }
@@ -162,9 +153,9 @@ impl<'a> GridSearch<'a> {
         floor: f64,
         advance: &mut dyn FnMut(u64),
     ) -> io::Result<Vec<Rung>> {
-        let (step, alone) = self.at_psnr_with_loans(psnr, floor, advance)?;
+        let (step, alone) = self.at_psnr_with_loans(psnr, floor, None, advance)?;
         self.find_loans(&alone, step, advance)?;
-        let (_, together) = self.at_psnr_with_loans(psnr, floor, advance)?;
+        let (_, together) = self.at_psnr_with_loans(psnr, floor, Some(step), advance)?;
         let bits = |picks: &[Rung]| self.table.sum(|id, weighed| weighed.bits(picks[id as usize]));
         if bits(&together)? < bits(&alone)? {
             return Ok(together);
@@ -177,13 +168,15 @@ impl<'a> GridSearch<'a> {
         &mut self,
         psnr: f64,
         floor: f64,
+        mut near: Option<u32>,
         advance: &mut dyn FnMut(u64),
     ) -> io::Result<(u32, Vec<Rung>)> {
         let allowed = Self::allowance(self.active_voxels, psnr);
         loop {
             let span = trace::span("search");
-            let step = first_step(|step| Ok(self.squares_at(step)? <= allowed))?;
+            let step = first_step(near, |step| Ok(self.squares_at(step)? <= allowed))?;
             drop(span);
+            near = Some(step);
             let fine = self.picks(step)?;
             if self.try_unknown((0..).zip(fine.iter().copied()), advance)? {
                 continue;
@@ -283,12 +276,11 @@ impl<'a> GridSearch<'a> {
     }
 
     pub(super) fn within(&mut self, bound: f64, advance: &mut dyn FnMut(u64)) -> io::Result<Vec<Rung>> {
-        let all: Vec<u32> = (0..self.table.len()).collect();
         let fits = |cost: &Cost| cost.norm.is_finite() && f64::from(cost.max) <= bound;
         loop {
-            let mut picks = Vec::with_capacity(all.len());
-            for ids in all.chunks(BRICKS_IN_FLIGHT as usize) {
-                let costs = costs(&self.encodings, ids, &self.bc7_is_tried)?;
+            let mut picks = Vec::with_capacity(self.table.len() as usize);
+            for ids in windows(self.table.len()) {
+                let costs = costs(&self.encodings, &ids, &self.bc7_is_tried)?;
                 picks.extend(costs.iter().map(|(costs, _)| {
                     Rung::ALL.into_iter().find(|&rung| fits(&costs[rung as usize])).unwrap_or(Rung::F32)
                 }));
@@ -357,7 +349,7 @@ impl<'a> GridSearch<'a> {
                 let squares = |step| -> f64 {
                     weighed().map(|(id, weighed)| weighed.active_squares(self.pick(id, weighed, step))).sum()
                 };
-                let step = first_step(|step| Ok(squares(step) <= allowed))?;
+                let step = first_step(None, |step| Ok(squares(step) <= allowed))?;
                 let mut picked: Vec<_> =
                     weighed().map(|(id, weighed)| (id, self.pick(id, weighed, step))).collect();
                 picked.sort_unstable_by_key(|(id, _)| *id);
@@ -397,10 +389,9 @@ impl<'a> GridSearch<'a> {
     pub(super) fn finish(self, picks: &[Rung]) -> io::Result<Allocation> {
         let Self { tree, encodings, bc7_is_tried, table, .. } = self;
         let loans = table.into_loans();
-        let all: Vec<u32> = (0..picks.len() as u32).collect();
-        let (mut norms, mut codings) = (Vec::with_capacity(all.len()), Vec::with_capacity(all.len()));
-        for ids in all.chunks(BRICKS_IN_FLIGHT as usize) {
-            for (&id, (costs, value)) in ids.iter().zip(costs(&encodings, ids, &bc7_is_tried)?) {
+        let (mut norms, mut codings) = (Vec::with_capacity(picks.len()), Vec::with_capacity(picks.len()));
+        for ids in windows(picks.len() as u32) {
+            for (&id, (costs, value)) in ids.iter().zip(costs(&encodings, &ids, &bc7_is_tried)?) {
                 let rung = picks[id as usize];
                 norms.push(
                     loans
@@ -441,9 +432,40 @@ impl<'a> GridSearch<'a> {
     }
 }
 
-/// The first step, of 0 to [`LAST_STEP`], that meets what every finer one meets too; the last if none does.
-pub(super) fn first_step(mut meets: impl FnMut(u32) -> io::Result<bool>) -> io::Result<u32> {
+/// All bricks, as many at a time as are looked at together.
+fn windows(bricks: u32) -> impl Iterator<Item = Vec<u32>> {
+    (0..bricks).step_by(BLOCK as usize).map(move |first| (first..(first + BLOCK).min(bricks)).collect())
+}
+
+/// The first step, of 0 to [`LAST_STEP`], that meets what every finer one meets too; the last if none does. Near a step
+/// that is known to be close by it is found in fewer looks.
+pub(super) fn first_step(
+    near: Option<u32>,
+    mut meets: impl FnMut(u32) -> io::Result<bool>,
+) -> io::Result<u32> {
     let (mut low, mut high) = (0, LAST_STEP);
+    if let Some(near) = near {
+        let (mut at, mut stride) = (near, 1);
+        let is_down = meets(near)?;
+        if is_down {
+            high = near
+        } else {
+            low = near + 1
+        }
+        while low < high {
+            at = if is_down { at.saturating_sub(stride).max(low) } else { (at + stride).min(high - 1) };
+            stride *= 2;
+            let met = meets(at)?;
+            if met {
+                high = at
+            } else {
+                low = at + 1
+            }
+            if met != is_down {
+                break;
+            }
+        }
+    }
     while low < high {
         let middle = (low + high) / 2;
         if meets(middle)? {
@@ -475,7 +497,7 @@ pub(super) fn switches(
     let differ: Vec<u32> =
         (0..).zip(coarse.iter().zip(fine)).filter(|(_, (a, b))| a != b).map(|(id, _)| id).collect();
     let mut switches = Vec::with_capacity(differ.len());
-    for ids in differ.chunks(BRICKS_IN_FLIGHT as usize) {
+    for ids in differ.chunks(BLOCK as usize) {
         for (&brick, choices) in ids.iter().zip(&search.table.read(ids)?) {
             let weighed = search.table.weighed(brick, choices);
             let (from, to) = (coarse[brick as usize], fine[brick as usize]);

@@ -109,12 +109,15 @@ pub(super) fn loans(
             .par_iter()
             .map(|comparison| comparison.known(encodings, tree))
             .collect::<io::Result<_>>()?;
+        // Frames whose voxels are not there are read side by side.
+        let unknown = comparisons.iter().zip(&known).filter(|(_, (_, known))| known.is_none());
+        let unknown: Vec<u32> = unknown.flat_map(|(comparison, _)| &comparison.borrowers).copied().collect();
+        tree.fetch(&unknown)?;
         for (comparison, (key, known)) in comparisons.iter().zip(known) {
             crate::interrupt::check()?;
             let offers = match known {
                 Some(offers) => offers,
                 None => {
-                    tree.fetch(&comparison.borrowers)?;
                     near.move_to(encodings, tree, &comparison.around, &lenders)?;
                     let offers = comparison.nearest(encodings, tree, &near)?;
                     if let Some((cache, key)) = encodings.cache().zip(key) {

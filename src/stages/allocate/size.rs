@@ -99,7 +99,7 @@ fn at_size_above(
     searches.iter_mut().for_each(|s| s.least_step.fill(0));
     loop {
         // The first step that is too large: the one before is the last that fits.
-        let too_large = first_step(|step| Ok(bytes(searches, &all(searches, step)?, fixed) > limit))?;
+        let too_large = first_step(None, |step| Ok(bytes(searches, &all(searches, step)?, fixed) > limit))?;
         let fits = too_large.saturating_sub(1);
         let mut unknown = false;
         for step in [fits, too_large] {

@@ -104,11 +104,16 @@ impl<const N: usize> Kept<N> {
 
     /// Keeps what was made of some bricks of a pool of `bricks`.
     pub fn add(&mut self, bricks: usize, ids: &[u32], notes: &[[Note; N]], texels: &[u8]) -> io::Result<()> {
-        for (i, (&id, notes)) in ids.iter().zip(notes).enumerate() {
-            let place = self.places.take(bricks, id);
-            self.notes.put(place, bytemuck::cast_slice(notes))?;
+        let places: Vec<u32> = ids.iter().map(|&id| self.places.take(bricks, id)).collect();
+        let (mut notes, mut texels) = (notes, texels);
+        for places in places.chunk_by(|a, b| *b == a + 1) {
+            let (now, later) = notes.split_at(places.len());
+            self.notes.put(places[0], bytemuck::cast_slice(now.as_flattened()))?;
+            notes = later;
             if let Some(scratch) = &mut self.texels {
-                scratch.put(place, &texels[i * scratch.record()..][..scratch.record()])?;
+                let (now, later) = texels.split_at(places.len() * scratch.record());
+                scratch.put(places[0], now)?;
+                texels = later;
             }
         }
         Ok(())

@@ -135,20 +135,15 @@ pub fn serialise(
         .iter_mut()
         .filter_map(|g| Some(GridBricks { tree: &mut g.tree, allocation: g.allocation.as_mut()? }))
         .collect();
-    for planned in &layout.atlases {
-        writer.begin()?;
-        let encoding = encoding(kind::TEXELS, planned.atlas.codec as u32);
-        quantise(
-            planned,
-            &mut sources,
-            &mut outcomes,
-            |slab| compress_chunk(slab, encoding, level),
-            |chunk| {
-                progress(planned.atlas.slab_bricks().into());
-                writer.chunk(&chunk)
-            },
-        )?;
-    }
+    let compressed =
+        |atlas: &Atlas, slab| compress_chunk(slab, encoding(kind::TEXELS, atlas.codec as u32), level);
+    quantise(&layout.atlases, &mut sources, &mut outcomes, compressed, |atlas, slab, chunk| {
+        if slab == 0 {
+            writer.begin()?;
+        }
+        progress(atlas.slab_bricks().into());
+        writer.chunk(&chunk)
+    })?;
     set_errors(&mut frames, grids, &outcomes);
     writer.section(bytemuck::cast_slice(&grid_records(grids, &outcomes)), level)?;
     writer.section(names.as_bytes(), level)?;
