@@ -10,7 +10,7 @@ use super::field::{Content, Field};
 use super::image::Image;
 use super::surface::{cubic, evaluate, first_change};
 use super::traverse::{Box3, Ray, Real, Walk};
-use super::{Mode, Traversal};
+use super::{Interpolation, Mode, Traversal};
 use crate::pack::{Frame, Grid};
 use crate::vdb::GridClass;
 use crate::volume::{Coord, CoordBox, ROOT_DIM};
@@ -30,6 +30,8 @@ pub struct Scene {
     pub matrix: [f64; 16],
     /// Whether the grid's zero is a surface.
     pub level_set: bool,
+    /// And between which values.
+    pub interpolation: Interpolation,
     /// Optical depth of a density of 1 over a world unit.
     pub extinction: f64,
     /// Densities above this are a hit.
@@ -62,9 +64,15 @@ impl Scene {
             size,
             matrix,
             level_set: grid.record.class == GridClass::LevelSet as u32,
+            interpolation: Interpolation::default(),
             extinction: if extent > 0.0 { BOX_DEPTH / extent } else { 0.0 },
             threshold: HIT_DENSITY * grid.record.active_max,
         }
+    }
+
+    /// Whether cells lie between voxels, which are their corners; else they are voxels.
+    fn is_trilinear(&self) -> bool {
+        self.level_set && self.interpolation == Interpolation::Trilinear
     }
 }
 
@@ -102,8 +110,8 @@ impl Setup {
         let size =
             |a: usize| if voxels.is_empty() { 0 } else { (voxels.max.0[a] - base[a]).saturating_add(1) };
         let bounds = Box3 { min: [0; 3], max: std::array::from_fn(size) };
-        let bounds = if scene.level_set { bounds.grown() } else { bounds };
-        let shift = if scene.level_set { 0.0 } else { 0.5 };
+        let bounds = if scene.is_trilinear() { bounds.grown() } else { bounds };
+        let shift = if scene.is_trilinear() { 0.0 } else { 0.5 };
         let shift = base.map(|b| shift - f64::from(b));
         let lens = Lens::new(&scene.camera, &scene.matrix, scene.size, shift)?;
         // world = index · M, so gradients go by the inverse transposed: row r of it is what index
@@ -206,24 +214,31 @@ impl<F: Real> Tracer<'_, F> {
     fn first_hit(&self, ray: &Ray<F>, steps: &mut u32) -> Option<Hit<F>> {
         let bounds = self.setup.bounds;
         let walk = Walk::enter(ray, bounds)?;
-        if self.scene.level_set {
-            self.first_surface(ray, bounds, walk, steps)
-        } else {
-            self.first_density(ray, bounds, walk, steps)
+        if self.scene.is_trilinear() {
+            return self.first_surface(ray, bounds, walk, steps);
         }
+        if !self.scene.level_set {
+            return self.first_voxel(ray, bounds, walk, steps, |value| value > self.scene.threshold);
+        }
+        let mut negative = None;
+        let hit = self.first_voxel(ray, bounds, walk, steps, |value| {
+            *negative.get_or_insert(value < 0.0) != (value < 0.0)
+        });
+        hit.map(|hit| Hit { value: 1.0, ..hit })
     }
 
-    fn first_density(
+    fn first_voxel(
         &self,
         ray: &Ray<F>,
         bounds: Box3,
         mut walk: Walk<F>,
         steps: &mut u32,
+        mut is_hit: impl FnMut(f32) -> bool,
     ) -> Option<Hit<F>> {
         while bounds.contains(walk.cell) && *steps < MAX_STEPS {
             *steps += 1;
             let (node, _, value) = self.node(walk.cell);
-            if value > self.scene.threshold {
+            if is_hit(value) {
                 return Some(Hit { t: walk.t, cell: walk.cell, normal: None, axis: walk.axis, value });
             }
             walk.leave(ray, node.within(bounds));

@@ -6,7 +6,8 @@
 //!
 //! Space: a fog voxel (i, j, k) is the cube around its index coordinate, so rays are moved by half a
 //! voxel and then voxel (i, j, k) is the *cell* from (i, j, k) to (i + 1, j + 1, k + 1). A level set is
-//! sampled at index coordinates and interpolated between them: its cells have eight voxels as corners.
+//! sampled at index coordinates and interpolated between them: its cells have eight voxels as corners,
+//! unless [`Interpolation::Nearest`] is asked for.
 
 mod camera;
 mod cpu;
@@ -72,6 +73,16 @@ impl Mode {
     pub fn is_categorical(self) -> bool {
         matches!(self, Self::Bricks | Self::Steps | Self::Nodes | Self::Normals)
     }
+}
+
+/// What a level set is between its voxels.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+pub enum Interpolation {
+    /// What the nearest voxel is: its surface are the faces between voxels of different sign
+    Nearest,
+    /// Trilinear between eight voxels: its surface is smooth
+    #[default]
+    Trilinear,
 }
 
 /// How a ray steps.

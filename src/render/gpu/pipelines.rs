@@ -10,7 +10,7 @@ use super::{TRACER_WGSL, VOLPACK_WGSL};
 use crate::codec::Codec;
 use crate::pack::Pack;
 use crate::pack::tree::header;
-use crate::render::{Mode, Scene, Traversal};
+use crate::render::{Interpolation, Mode, Scene, Traversal};
 
 /// What occurs in a pack, as far as the shader cares.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -36,6 +36,7 @@ struct Kind {
     mode: u32,
     hdda: bool,
     level_set: bool,
+    trilinear: bool,
     has: Has,
 }
 
@@ -85,6 +86,7 @@ impl Pipelines {
             mode: scene.mode as u32,
             hdda: scene.traversal == Traversal::Hdda,
             level_set: scene.level_set,
+            trilinear: scene.interpolation == Interpolation::Trilinear,
             has,
         };
         let mut made = self.made.lock().unwrap_or_else(PoisonError::into_inner);
@@ -102,6 +104,7 @@ impl Pipelines {
                     ("MODE", kind.mode.into()),
                     ("HDDA", kind.hdda.into()),
                     ("LEVEL_SET", kind.level_set.into()),
+                    ("TRILINEAR", kind.trilinear.into()),
                     ("VP_CODECS", kind.has.codecs.into()),
                     ("VP_MASKS", kind.has.masks.into()),
                 ],

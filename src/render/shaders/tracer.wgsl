@@ -28,6 +28,7 @@ struct Params {
 override MODE: u32 = 0u;
 override HDDA: bool = true;
 override LEVEL_SET: bool = false;
+override TRILINEAR: bool = true;     // of level sets: else the nearest voxel
 
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> tree: array<u32>;
@@ -127,8 +128,11 @@ struct Hit {
 const MISS = Hit(false, 0.0, vec3i(0), 3, 0.0);
 
 fn first_hit(ray: VpRay) -> Hit {
-    if LEVEL_SET {
+    if LEVEL_SET && TRILINEAR {
         return first_surface(ray);
+    }
+    if LEVEL_SET {
+        return first_sign(ray);
     }
     return first_density(ray);
 }
@@ -159,6 +163,49 @@ fn first_density(ray: VpRay) -> Hit {
             if value > params.threshold {
                 return Hit(true, walk.t, walk.cell, walk.axis, value);
             }
+            walk = vp_step(ray, walk);
+            if any(walk.cell == behind) || steps >= MAX_STEPS {
+                break;
+            }
+        }
+    }
+    return MISS;
+}
+
+// The first voxel of another sign than the first.
+fn first_sign(ray: VpRay) -> Hit {
+    var walk = vp_enter(ray, params.low, params.high);
+    if !traced(walk) {
+        return MISS;
+    }
+    let g = vp_grid(params.grid);
+    var cell = VP_NOWHERE;
+    var first = VP_EITHER;
+    while traced(walk) {
+        let at = place_of(g, cell, walk.cell);
+        cell = at.cell;
+        let sign = vp_sign(g, at.node);
+        if HDDA && at.node.constant {
+            steps++;
+            if first + sign == VP_NEGATIVE {
+                return Hit(true, walk.t, walk.cell, walk.axis, 1.0);
+            }
+            first = sign;
+            walk = vp_leave(ray, walk, at.low, at.high);
+            continue;
+        }
+        let brick = vp_brick(g, at.node);
+        let behind = vp_behind(ray, at.low, at.high);
+        loop {
+            steps++;
+            var here = sign;
+            if here == VP_EITHER {
+                here = u32(vp_value(g, brick, walk.cell + params.base) < 0.0);
+            }
+            if first + here == VP_NEGATIVE {
+                return Hit(true, walk.t, walk.cell, walk.axis, 1.0);
+            }
+            first = here;
             walk = vp_step(ray, walk);
             if any(walk.cell == behind) || steps >= MAX_STEPS {
                 break;
@@ -328,7 +375,7 @@ fn first_change(c: vec4f, negative: bool) -> f32 {
 
 // A surface's own normal in world space; else that of the face, in cell space.
 fn normal_at(ray: VpRay, hit: Hit) -> vec3f {
-    if !LEVEL_SET {
+    if !(LEVEL_SET && TRILINEAR) {
         return select(vec3f(0.0), select(vec3f(1.0), vec3f(-1.0), ray.forward), VP_AXES == vec3i(hit.axis));
     }
     let g = vp_grid(params.grid);
