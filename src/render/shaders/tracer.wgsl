@@ -237,7 +237,9 @@ fn first_surface(ray: VpRay) -> Hit {
         let skips = HDDA && at.node.constant;
         let alone = skips && at.node.dim == 8 && vp_alone(l2, walk.cell + params.base);
         let inner = min(at.high, at.node.min - params.base + at.node.dim - select(1, 0, alone));
-        let behind = vp_behind(ray, at.low, at.high);
+        // Beside the last layer of a larger node the parts of cells change from brick to brick.
+        let block = ((walk.cell + params.base) & vec3i(-8)) - params.base;
+        let behind = vp_behind(ray, max(block, at.low), min(block + 8, at.high));
         // Two bits for each part that a cell may have: its sign, or 3 until it is looked up.
         var signs = 0xfffcu | vp_sign(g, at.node);
         let brick = vp_brick(g, at.node);
@@ -251,7 +253,7 @@ fn first_surface(ray: VpRay) -> Hit {
                 known = true;
                 negative = sign;
                 walk = vp_leave(ray, walk, at.low, inner);
-                if any(walk.cell == behind) || steps >= MAX_STEPS {
+                if at.node.dim > 8 || any(walk.cell == behind) || steps >= MAX_STEPS {
                     break;
                 }
                 continue;
