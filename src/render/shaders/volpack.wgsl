@@ -292,7 +292,8 @@ fn vp_part(g: VpGrid, frame: u32, cell: VpCell, p: vec3i, part: u32) -> VpNode {
     return vp_find(g, vp_cell(g, frame, cell, q), q);
 }
 
-// The corners of the cell from p, which lies in the brick, to p + 1.
+// The corners of the cell from p, which lies in the brick, to p + 1. One loop for both z: more code, above
+// all that of several codecs, costs more than its turns.
 fn vp_corners(g: VpGrid, frame: u32, cell: VpCell, brick: VpBrick, p: vec3i) -> VpCorners {
     var c: VpCorners;
     let edges = vp_edges(p);
@@ -303,11 +304,12 @@ fn vp_corners(g: VpGrid, frame: u32, cell: VpCell, brick: VpBrick, p: vec3i) -> 
             b = vp_brick(g, vp_part(g, frame, cell, p, part));
         }
         let inside = (vec4u(0u, 1u, 2u, 3u) & vec4u(edges & 3u)) == vec4u(part & 3u);
-        if (part & 4u) == 0u {
-            c.near = select(c.near, vp_quad(g, b, p), inside);
-        }
-        if (part & 4u) == (edges & 4u) {
-            c.far = select(c.far, vp_quad(g, b, p + vec3i(0, 0, 1)), inside);
+        for (var z = 0u; z < 2u; z++) {
+            if ((4u * z) & edges) == (part & 4u) {
+                let quad = vp_quad(g, b, p + vec3i(0, 0, i32(z)));
+                c.near = select(c.near, quad, inside & vec4<bool>(z == 0u));
+                c.far = select(c.far, quad, inside & vec4<bool>(z == 1u));
+            }
         }
         part = vp_next_part(part, edges);
         if part == 0u {
