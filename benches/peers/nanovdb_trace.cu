@@ -1,10 +1,11 @@
 // Traces a NanoVDB grid of floats with NanoVDB's own HDDA and accessor, along the rays that volpack traces.
 //
-//     nanovdb_trace GRID.nvdb fog|level WIDTH HEIGHT REPEATS PICTURE < rays
+//     nanovdb_trace GRID.nvdb fog|nearest|trilinear WIDTH HEIGHT REPEATS PICTURE < rays
 //
 // `rays` is numbers: origin, the middle ray, and from there to the right edge and to the top (three each, in
-// index space, a voxel being the cube from its coordinate to the next). PICTURE gets one f32 a pixel, in voxels:
-// the integral of density over the ray, or the distance to the first zero of a level set, -1 without one.
+// index space; unless it is trilinear, a voxel is the cube from its coordinate to the next). PICTURE gets one
+// f32 a pixel, in voxels: the integral of density over the ray, or the distance to the first zero of a level
+// set, -1 without one: where a voxel's sign is another (nearest), or of the interpolant of eight (trilinear).
 // Standard output gets the milliseconds of each frame.
 
 #include <nanovdb/util/HDDA.h>
@@ -20,6 +21,8 @@
 
 using nanovdb::Coord;
 using Grid = nanovdb::NanoGrid<float>;
+using Accessor = nanovdb::DefaultReadAccessor<float>;
+using Leaf = nanovdb::NanoLeaf<float>;
 using Ray = nanovdb::Ray<float>;
 using Vec = nanovdb::Vec3<float>;
 
@@ -69,7 +72,7 @@ __device__ float fog(const Grid& grid, Ray ray)
 
 // Where NanoVDB's own function sees the sign change. (Any arithmetic on t here makes nvcc 13's code for
 // it 1.6 times slower: units are the caller's business.)
-__device__ float level(const Grid& grid, Ray ray)
+__device__ float nearest(const Grid& grid, Ray ray)
 {
     auto accessor = grid.tree().getAccessor();
     Coord ijk;
@@ -77,14 +80,129 @@ __device__ float level(const Grid& grid, Ray ray)
     return nanovdb::ZeroCrossing(ray, accessor, ijk, value, t) ? t : -1;
 }
 
-template <bool FOG>
+// The eight voxels from ijk on, ordered by x + 2y + 4z: straight from a leaf that holds them all.
+__device__ void corners(Accessor& accessor, const Coord& ijk, float* v)
+{
+    const Leaf* leaf = accessor.probeLeaf(ijk);
+    if (leaf && (ijk[0] & 7) < 7 && (ijk[1] & 7) < 7 && (ijk[2] & 7) < 7) {
+        const float* first = leaf->data()->mValues + Leaf::CoordToOffset(ijk);
+#pragma unroll
+        for (int i = 0; i < 8; i++)
+            v[i] = first[(i & 1) * 64 + (i >> 1 & 1) * 8 + (i >> 2)];
+    } else {
+#pragma unroll
+        for (int i = 0; i < 8; i++)
+            v[i] = accessor.getValue(ijk + Coord(i & 1, i >> 1 & 1, i >> 2));
+    }
+}
+
+// The interpolant of a cell along a ray, from `p` on by `d`, as a cubic in 0 to 1, lowest power first.
+struct Cubic
+{
+    float c[4];
+
+    Cubic() = default;
+
+    __device__ Cubic(const float* v, const Vec& p, const Vec& d)
+    {
+        const float x = v[1] - v[0], y = v[2] - v[0], z = v[4] - v[0];
+        const float xy = v[3] - v[1] - y, yz = v[6] - v[2] - z, xz = v[5] - v[1] - z;
+        const float xyz = v[7] - v[3] - v[5] - v[6] + v[1] + v[2] + z;
+        c[0] = v[0] + x * p[0] + y * p[1] + z * p[2] + xy * p[0] * p[1] + yz * p[1] * p[2] + xz * p[0] * p[2]
+            + xyz * p[0] * p[1] * p[2];
+        c[1] = x * d[0] + y * d[1] + z * d[2] + xy * (p[0] * d[1] + d[0] * p[1]) + yz * (p[1] * d[2] + d[1] * p[2])
+            + xz * (p[0] * d[2] + d[0] * p[2])
+            + xyz * (p[0] * p[1] * d[2] + p[0] * d[1] * p[2] + d[0] * p[1] * p[2]);
+        c[2] = xy * d[0] * d[1] + yz * d[1] * d[2] + xz * d[0] * d[2]
+            + xyz * (p[0] * d[1] * d[2] + d[0] * p[1] * d[2] + d[0] * d[1] * p[2]);
+        c[3] = xyz * d[0] * d[1] * d[2];
+    }
+
+    __device__ bool changed(float u, bool negative) const
+    {
+        return ((((c[3] * u + c[2]) * u + c[1]) * u + c[0]) < 0) != negative;
+    }
+
+    // Between which places its sign first changes: cut where it turns, each piece has at most one root.
+    __device__ bool bracket(bool negative, float& low, float& high) const
+    {
+        low = high = 0;
+        if (changed(0, negative))
+            return true;
+        float first = 0, second = 0;
+        const float a = 3 * c[3], discriminant = c[2] * c[2] - a * c[1];
+        if (discriminant >= 0) {
+            const float root = sqrtf(discriminant), q = c[2] < 0 ? root - c[2] : -(root + c[2]);
+            first = a == 0 ? 0 : q / a;
+            second = q == 0 ? 0 : c[1] / q;
+        }
+        for (const float end : { fminf(first, second), fmaxf(first, second), 1.0f }) {
+            if (end > low && end <= 1) {
+                high = end;
+                if (changed(high, negative))
+                    return true;
+                low = high;
+            }
+        }
+        return false;
+    }
+};
+
+// The first zero of the trilinear interpolant. As in any narrow band, cells with a zero begin at an active
+// voxel. Halving comes after all steps, with the whole warp: that halves the time.
+__device__ float trilinear(const Grid& grid, Ray ray)
+{
+    auto accessor = grid.tree().getAccessor();
+    if (!ray.clip(accessor.root().bbox()))
+        return -1;
+    Coord ijk = nanovdb::RoundDown<Coord>(ray(ray.t0() + 1e-3f));
+    nanovdb::HDDA<Ray, Coord> hdda(ray, accessor.getDim(ijk, ray));
+    const bool negative = accessor.getValue(ijk) < 0;
+    bool found = false;
+    float start = 0, length = 0, low = 0, high = 0;
+    Cubic cubic;
+    for (bool inside = true; inside && !found;) {
+        ijk = nanovdb::RoundDown<Coord>(ray(hdda.time() + 1e-3f));
+        hdda.update(ray, accessor.getDim(ijk, ray));
+        if (hdda.dim() == 1 && accessor.isActive(ijk)) {
+            do {
+                ijk = hdda.voxel();
+                float v[8];
+                corners(accessor, ijk, v);
+                bool mixed = false;
+#pragma unroll
+                for (int i = 0; i < 8; i++)
+                    mixed |= (v[i] < 0) != negative;
+                if (mixed) {
+                    start = hdda.time();
+                    length = hdda.next() - start;
+                    const Vec from = ray(start) - Vec(float(ijk[0]), float(ijk[1]), float(ijk[2]));
+                    cubic = Cubic(v, from, ray.dir() * length);
+                    found = cubic.bracket(negative, low, high);
+                }
+            } while (!found && hdda.step() && accessor.isActive(hdda.voxel()));
+        }
+        if (!found)
+            inside = hdda.step();
+    }
+    if (!found)
+        return -1;
+    for (int n = 0; n < 24; n++) {
+        const float middle = (low + high) * 0.5f;
+        const bool change = cubic.changed(middle, negative);
+        high = change ? middle : high;
+        low = change ? low : middle;
+    }
+    return start + length * high;
+}
+
+template <float TRACE(const Grid&, Ray)>
 __global__ void trace(const Grid* grid, View view, float* picture)
 {
     const int x = blockIdx.x * blockDim.x + threadIdx.x, y = blockIdx.y * blockDim.y + threadIdx.y;
     if (x >= view.width || y >= view.height)
         return;
-    const Ray ray = ray_of(view, x, y);
-    picture[y * view.width + x] = FOG ? fog(*grid, ray) : level(*grid, ray);
+    picture[y * view.width + x] = TRACE(*grid, ray_of(view, x, y));
 }
 
 int main(int count, char** arguments)
@@ -95,7 +213,8 @@ int main(int count, char** arguments)
     for (Vec* vector : { &view.origin, &view.forward, &view.right, &view.up })
         if (!(std::cin >> (*vector)[0] >> (*vector)[1] >> (*vector)[2]))
             return 2;
-    const bool is_fog = std::string(arguments[2]) == "fog";
+    const std::string shows = arguments[2];
+    const auto kernel = shows == "fog" ? trace<fog> : shows == "nearest" ? trace<nearest> : trace<trilinear>;
     view.width = std::atoi(arguments[3]);
     view.height = std::atoi(arguments[4]);
     const int repeats = std::atoi(arguments[5]);
@@ -114,13 +233,12 @@ int main(int count, char** arguments)
     cudaEvent_t start, end;
     check(cudaEventCreate(&start));
     check(cudaEventCreate(&end));
-    const dim3 block(8, 8), blocks((view.width + 7) / 8, (view.height + 7) / 8);
+    // Trilinear is 4 % faster in blocks of 8 × 16 than of 8 × 8.
+    const dim3 block(8, shows == "trilinear" ? 16 : 8);
+    const dim3 blocks((view.width + 7) / 8, (view.height + block.y - 1) / block.y);
     for (int i = 0; i < repeats; i++) {
         check(cudaEventRecord(start));
-        if (is_fog)
-            trace<true><<<blocks, block>>>(static_cast<Grid*>(grid), view, pixels);
-        else
-            trace<false><<<blocks, block>>>(static_cast<Grid*>(grid), view, pixels);
+        kernel<<<blocks, block>>>(static_cast<Grid*>(grid), view, pixels);
         check(cudaEventRecord(end));
         check(cudaEventSynchronize(end));
         float milliseconds;

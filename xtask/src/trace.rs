@@ -10,7 +10,7 @@ use serde_json::json;
 use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::render::gpu::Gpu;
-use volpack::render::{Image, Lens, Mode, Scene, Traversal, View};
+use volpack::render::{Image, Interpolation, Lens, Mode, Scene, Traversal, View};
 use volpack::settings::{Format, Settings};
 use volpack::sweep::nanovdb::{self, Quantise};
 
@@ -41,6 +41,12 @@ const VIEW: View = View::Orbit([39.8056, 20.4927, 1.0]);
 /// Pictures before those that count, while clocks rise.
 const WARM_UP: u32 = 10;
 
+/// What is shown of a level set or of fog: its name, which is the peer's word too, and how.
+type Shown = (&'static str, Mode, Interpolation);
+const FOG: &[Shown] = &[("fog", Mode::Density, Interpolation::Trilinear)];
+const LEVEL_SET: &[Shown] =
+    &[("trilinear", Mode::Depth, Interpolation::Trilinear), ("nearest", Mode::Depth, Interpolation::Nearest)];
+
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     let gpu = Gpu::shared()?;
     let folder = tempfile::tempdir()?;
@@ -58,8 +64,9 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     println!("|---|---|---|---|---|---|---|---|---|---|---|");
     for path in &args.files {
         let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        let mut theirs = None;
+        let mut theirs: Vec<(&str, Theirs)> = Vec::new();
         let mut camera = None;
+        let mut lines = Vec::new();
         for format in Format::ALL {
             let job = Job::new(
                 vec![path.clone()],
@@ -72,47 +79,52 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             let uploaded = gpu.upload(&pack)?;
             let bounds = pack.frame_tree(0, 0).bounds();
             let grid = &pack.grids[0];
-            // Level sets: depth; fog: accumulated density.
-            let level_set = grid.record.class == 1;
-            let (mode, shows) = if level_set { (Mode::Depth, "depth") } else { (Mode::Density, "density") };
-            let scene = Scene::new(grid, &grid.frames[0], bounds, &VIEW, mode, size);
-            // That of the first format for all: lossy packs may have a smaller box.
-            let camera = *camera.get_or_insert(scene.camera);
-            let scene = Scene { camera, ..scene };
-            if let (None, Ok(peer)) = (&theirs, &peer) {
-                theirs = Some(nanovdb_trace(peer, path, &grid.name, &scene, args.repeats, folder.path())?);
-            }
-            let mut row = Vec::new();
-            let mut apart = None;
-            for traversal in [Traversal::Hdda, Traversal::Dda] {
-                let scene = Scene { traversal, ..scene };
-                let repeats = args.repeats + WARM_UP;
-                let (image, ms) = gpu.trace_timed(&uploaded, [0, 0], bounds, &scene, repeats)?;
-                apart = apart.or_else(|| theirs.as_ref().map(|t: &Theirs| t.apart(&image, &scene)));
-                let ms = ms.get(WARM_UP as usize..).unwrap_or_default();
-                row.push((median(ms.iter().copied()), image.mean_steps()));
-                rows.push(json!({ "volume": name, "format": format, "traversal": format!("{traversal:?}"),
-                    "milliseconds": ms, "mean_steps": image.mean_steps() }));
-            }
-            let [(hdda, hdda_steps), (dda, dda_steps)] = row[..] else { return Err("two traversals".into()) };
-            let beside = match (&theirs, apart) {
-                (Some(t), Some(apart)) => {
-                    let theirs = median(t.milliseconds.iter().copied());
-                    format!("{theirs:.3} | {:.2} | {apart:.1e}", hdda / theirs)
+            for &(shows, mode, interpolation) in if grid.record.class == 1 { LEVEL_SET } else { FOG } {
+                let scene = Scene::new(grid, &grid.frames[0], bounds, &VIEW, mode, size);
+                // That of the first format for all: lossy packs may have a smaller box.
+                let camera = *camera.get_or_insert(scene.camera);
+                let scene = Scene { camera, interpolation, ..scene };
+                if let (Format::F32, Ok(peer)) = (format, &peer) {
+                    let traced =
+                        nanovdb_trace(peer, path, &grid.name, shows, &scene, args.repeats, folder.path())?;
+                    theirs.push((shows, traced));
                 }
-                _ => " | | ".to_owned(),
-            };
-            println!(
-                "| {name} | {shows} | {} | {hdda:.3} | {beside} | {dda:.3} | {:.2} | {hdda_steps:.1} | {dda_steps:.1} |",
-                format.name(),
-                dda / hdda
-            );
+                let theirs = theirs.iter().find(|(shown, _)| *shown == shows).map(|(_, theirs)| theirs);
+                let mut row = Vec::new();
+                let mut apart = None;
+                for traversal in [Traversal::Hdda, Traversal::Dda] {
+                    let scene = Scene { traversal, ..scene };
+                    let repeats = args.repeats + WARM_UP;
+                    let (image, ms) = gpu.trace_timed(&uploaded, [0, 0], bounds, &scene, repeats)?;
+                    apart = apart.or_else(|| theirs.map(|t| t.apart(&image, &scene)));
+                    let ms = ms.get(WARM_UP as usize..).unwrap_or_default();
+                    row.push((median(ms.iter().copied()), image.mean_steps()));
+                    rows.push(json!({ "volume": name, "shows": shows, "format": format,
+                        "traversal": format!("{traversal:?}"), "milliseconds": ms,
+                        "mean_steps": image.mean_steps() }));
+                }
+                let [(hdda, hdda_steps), (dda, dda_steps)] = row[..] else {
+                    return Err("two traversals".into());
+                };
+                let beside = match (theirs, apart) {
+                    (Some(t), Some(apart)) => {
+                        let theirs = median(t.milliseconds.iter().copied());
+                        format!("{theirs:.3} | {:.2} | {apart:.1e}", hdda / theirs)
+                    }
+                    _ => " | | ".to_owned(),
+                };
+                lines.push((shows, format!(
+                    "| {name} | {shows} | {} | {hdda:.3} | {beside} | {dda:.3} | {:.2} | {hdda_steps:.1} | {dda_steps:.1} |",
+                    format.name(),
+                    dda / hdda
+                )));
+            }
         }
-        if let Some(theirs) = theirs {
-            rows.push(
-                json!({ "volume": name, "format": "NanoVDB float", "milliseconds": theirs.milliseconds }),
-            );
-        }
+        lines.sort_by_key(|(shows, _)| std::cmp::Reverse(*shows));
+        lines.iter().for_each(|(_, line)| println!("{line}"));
+        rows.extend(theirs.iter().map(|(shows, theirs)| {
+            json!({ "volume": name, "shows": shows, "format": "NanoVDB float", "milliseconds": theirs.milliseconds })
+        }));
     }
     if let Some(path) = &args.json {
         std::fs::write(path, serde_json::to_string(&json!({ "device": gpu.name, "rows": rows }))?)?;
@@ -134,19 +146,23 @@ fn nanovdb_trace(
     peer: &Path,
     vdb: &Path,
     grid: &str,
+    shows: &str,
     scene: &Scene,
     repeats: u32,
     folder: &Path,
 ) -> Result<Theirs, Box<dyn Error>> {
     let (nvdb, out) = (folder.join("peer.nvdb"), folder.join("peer.f32"));
     nanovdb::convert(vdb, grid, &Quantise::Float, &nvdb)?;
-    // To NanoVDB a voxel is the cube from its coordinate on: half a voxel off from index space.
-    let lens = Lens::new(&scene.camera, &scene.matrix, scene.size, [0.5; 3]).ok_or("no inverse transform")?;
+    // To NanoVDB's steps a voxel is the cube from its coordinate on, half a voxel off from index space; between
+    // voxels a cell is.
+    let shift = if shows == "trilinear" { 0.0 } else { 0.5 };
+    let lens =
+        Lens::new(&scene.camera, &scene.matrix, scene.size, [shift; 3]).ok_or("no inverse transform")?;
     let rays = [lens.origin, lens.forward, lens.right, lens.up].concat();
     let rays: Vec<String> = rays.iter().map(ToString::to_string).collect();
     let mut child = Command::new(peer)
         .arg(&nvdb)
-        .arg(if scene.level_set { "level" } else { "fog" })
+        .arg(shows)
         .args(scene.size.map(|s| s.to_string()))
         .arg((repeats + WARM_UP).to_string())
         .arg(&out)
@@ -171,7 +187,7 @@ fn nanovdb_trace(
 
 impl Theirs {
     /// How far the pictures are apart. Fog: the mean difference of opacity. Level sets: the median difference
-    /// in voxels where both hit, since NanoVDB says where the ray enters the voxel behind the zero.
+    /// in voxels where both hit.
     fn apart(&self, ours: &Image, scene: &Scene) -> f64 {
         let pixels =
             ours.pixels.iter().map(|p| f64::from(p[0])).zip(self.picture.iter().map(|v| f64::from(*v)));
