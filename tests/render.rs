@@ -10,11 +10,14 @@ use std::path::Path;
 use common::{animation, build_verified, fixture};
 use volpack::pack::Pack;
 use volpack::pack::layout::{Section, kind};
+use volpack::pipeline::build_altered;
 use volpack::render::gpu::Gpu;
 use volpack::render::{
-    Device, Field, Image, Interpolation, Mode, Renderer, Scene, Traversal, View, difference, trace, write_png,
+    Camera, Device, Field, Image, Interpolation, Mode, Renderer, Scene, Traversal, View, difference, trace,
+    write_png,
 };
 use volpack::settings::{Format, Settings};
+use volpack::volume::{Cell, CellContent, Child, Constant, Coord, CoordBox, FlatFrame, ValueRange};
 
 const SIZE: [u32; 2] = [72, 56];
 
@@ -230,4 +233,46 @@ fn the_gpu_decodes_any_bc7_block_as_the_cpu_does() {
             assert_eq!(n, 0, "{mode:?} {view}: {most}");
         }
     }
+}
+
+#[test]
+fn a_large_node_s_neighbours_are_seen_brick_by_brick() {
+    let Ok(gpu) = Gpu::shared() else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let job = volpack::pipeline::Job::new(
+        vec![fixture("levelset_half.vdb")],
+        folder.path().join("test.volpack"),
+        Settings { grids: vec!["surface".to_owned()], format: Format::F32, ..Settings::default() },
+        volpack::pipeline::VerifyLevel::None,
+    );
+    // Positive up to x = 127; behind it regions of 8³ whose signs are those of a chessboard.
+    let chessboard = |frame: &mut FlatFrame| {
+        let sign = |place: u16| if (place >> 4 & 15) + (place & 15) & 1 == 0 { 1.0 } else { -1.0 };
+        let constant = |value| Constant { value, active: true };
+        let node = (0..256).map(|place| (place, Child::Constant(constant(sign(place))))).collect();
+        let cell = |x, content| Cell { origin: Coord::new(x, 0, 0), content };
+        frame.roots.clear();
+        frame.bricks.clear();
+        frame.cells = vec![cell(0, CellContent::Constant(constant(1.0))), cell(128, CellContent::Node(node))];
+        frame.stats.bbox = CoordBox { min: Coord::new(0, 0, 0), max: Coord::new(135, 127, 127) };
+        frame.stats.active_range = Some(ValueRange { min: -1.0, max: 1.0 });
+    };
+    build_altered(&job, &chessboard, &mut volpack::pipeline::Silent).unwrap();
+    let pack = Pack::open(&job.output).unwrap();
+    let reader = pack.frame(0, 0).unwrap();
+    let field = Field::from_pack(&reader).unwrap();
+    let mut scene = scene(&pack, &field, Mode::Depth, Traversal::Hdda, Interpolation::Trilinear);
+    // Along the last layer of the positive node, where every cell reaches into the chessboard.
+    let world = |[x, y, z]: [f64; 3]| {
+        let m = &scene.matrix;
+        std::array::from_fn(|a| x * m[a] + y * m[4 + a] + z * m[8 + a] + m[12 + a])
+    };
+    // Far off and narrow, so that most rays stay in it for long, and beside a positive region first.
+    scene.camera = Camera { eye: world([126.6, -100.0, 52.0]), target: world([127.6, 64.0, 52.0]), fov: 1.5 };
+    let ours = gpu.trace(&gpu.upload(&pack).unwrap(), [0, 0], field.bounds, &scene).unwrap();
+    let twin = trace::<f32>(&field, &scene).unwrap();
+    let hits = twin.pixels.iter().filter(|pixel| pixel[0] >= 0.0).count();
+    assert!(hits > ours.pixels.len() / 4, "the view shows what it is about: {hits}");
+    let (n, most) = differing(&twin, &ours, 0..3, 1e-3);
+    assert!(n <= 4, "{n} of {hits} pixels, at most {most}");
 }
