@@ -10,7 +10,7 @@ use crate::aside;
 use crate::error::{Error, Result};
 use crate::pack::Pack;
 use crate::render::gpu::GpuError;
-use crate::render::{Device, Mode, Renderer, Scene, Traversal, View, write_apng, write_png};
+use crate::render::{Device, Interpolation, Mode, Renderer, Scene, Traversal, View, write_apng, write_png};
 
 #[derive(Args)]
 pub struct RenderArgs {
@@ -43,6 +43,9 @@ pub struct RenderArgs {
     /// How rays step
     #[arg(long, default_value = "hdda")]
     traversal: Traversal,
+    /// What a level set is between its voxels
+    #[arg(long, default_value = "trilinear")]
+    interpolation: Interpolation,
 }
 
 #[derive(Clone, Copy, clap::ValueEnum)]
@@ -87,6 +90,7 @@ pub fn run(args: &RenderArgs, common: Common) -> Result<()> {
         let info = &pack.grids[grid];
         let scene = Scene {
             traversal: args.traversal,
+            interpolation: args.interpolation,
             ..Scene::new(info, &info.frames[frame], bounds, &args.camera, mode, args.size)
         };
         let image = renderer.render(grid, frame, &scene).map_err(|e| gpu_error(e, &args.pack))?;

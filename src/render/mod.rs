@@ -76,7 +76,7 @@ impl Mode {
 }
 
 /// What a level set is between its voxels.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 pub enum Interpolation {
     /// What the nearest voxel is: its surface are the faces between voxels of different sign
     Nearest,

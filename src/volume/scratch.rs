@@ -47,10 +47,15 @@ impl Scratch {
     /// When the file cannot be written.
     pub fn put(&mut self, place: u32, records: &[u8]) -> io::Result<()> {
         debug_assert!(records.len().is_multiple_of(self.record));
-        let next = self.buffered as usize + self.buffer.len() / self.record;
-        if place as usize != next {
+        let count = |bytes: &[u8]| (bytes.len() / self.record) as u32;
+        let (next, end) = (self.buffered + count(&self.buffer), place + count(records));
+        if place != next || records.len() >= BLOCK {
             self.flush()?;
             self.buffered = place;
+        }
+        if records.len() >= BLOCK {
+            self.buffered = end;
+            return self.write(self.at(place), records);
         }
         self.buffer.extend_from_slice(records);
         if self.buffer.len() >= BLOCK { self.flush() } else { Ok(()) }

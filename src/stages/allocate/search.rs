@@ -513,3 +513,25 @@ pub(super) fn switches(
     switches.sort_by(|a, b| b.gain.total_cmp(&a.gain).then(a.brick.cmp(&b.brick)));
     Ok(switches)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_first_step_is_found_from_anywhere() {
+        let ends = [0, 1, 2, 700, 3_199, 3_200, LAST_STEP - 1, LAST_STEP];
+        for (first, near) in ends.into_iter().flat_map(|first| ends.map(|near| (first, near))) {
+            for near in [None, Some(near)] {
+                let mut looks = 0;
+                let found = first_step(near, |step| {
+                    looks += 1;
+                    Ok(step >= first)
+                });
+                assert_eq!(found.unwrap(), first, "{near:?}");
+                // Twice a bisection's at most, and next to none where it is close by.
+                assert!(looks <= if near.is_some_and(|near| near.abs_diff(first) <= 1) { 4 } else { 26 });
+            }
+        }
+    }
+}
