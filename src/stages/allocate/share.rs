@@ -29,8 +29,9 @@ const STAGE: Stage = Stage { name: "share", version: 1, travels: true };
 
 /// Bricks to either side that a batch is compared with at least: in short frames those of a few.
 const LEAST_NEAR: usize = 128;
-/// Rows of one product: 64 × 6,144 similarities are 1.5 MB, and a frame has work for every core.
-const ROWS: usize = 64;
+/// Rows of one product: few enough that a frame of 300 bricks has work for every core to
+/// the end. 16 × 6,144 similarities are 0.4 MB.
+const ROWS: usize = 16;
 /// Lenders that are compared voxel by voxel.
 const CLOSEST: usize = 3;
 /// Values of a shape as it is first compared: means of 2³ voxels.
