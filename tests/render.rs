@@ -247,7 +247,7 @@ fn a_large_node_s_neighbours_are_seen_brick_by_brick() {
     );
     // Positive up to x = 127; behind it regions of 8³ whose signs are those of a chessboard.
     let chessboard = |frame: &mut FlatFrame| {
-        let sign = |place: u16| if (place >> 4 & 15) + (place & 15) & 1 == 0 { 1.0 } else { -1.0 };
+        let sign = |place: u16| if (place / 16 + place % 16).is_multiple_of(2) { 1.0 } else { -1.0 };
         let constant = |value| Constant { value, active: true };
         let node = (0..256).map(|place| (place, Child::Constant(constant(sign(place))))).collect();
         let cell = |x, content| Cell { origin: Coord::new(x, 0, 0), content };

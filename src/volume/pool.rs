@@ -16,7 +16,7 @@ pub const BRICKS_IN_FLIGHT: u32 = 4096;
 /// Stores bricks so that equal ones are kept once, and gives them back by number.
 ///
 /// A brick may be known before its values are: they are put in when someone has need of them. Memory is 6 bytes a
-/// unique brick, and 35 to 60 more until [`BrickPool::seal`]; voxels, masks and digests are in scratch files.
+/// unique brick, and 30 to 40 more until [`BrickPool::seal`]; voxels, masks and digests are in scratch files.
 pub struct BrickPool {
     by_digest: HashTable<u32>,
     digests: List<Key>,
