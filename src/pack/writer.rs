@@ -160,6 +160,21 @@ impl PackWriter {
         Ok(())
     }
 
+    /// The same for words that are made as they are written.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn words(&mut self, words: impl Iterator<Item = u32>, level: i32) -> io::Result<()> {
+        self.begin()?;
+        let spec = self.specs[self.sections.len() - 1];
+        let mut words = words.peekable();
+        while words.peek().is_some() {
+            let chunk: Vec<u32> = words.by_ref().take(spec.chunk_bytes as usize / 4).collect();
+            self.chunk(&compress_chunk(bytemuck::cast_slice(&chunk).to_vec(), spec.encoding, level)?)?;
+        }
+        Ok(())
+    }
+
     /// Fills in the tables and syncs. The file is whole then, but not yet in its place.
     ///
     /// # Errors

@@ -72,16 +72,13 @@ pub enum TextureOf {
 /// Gives each brick its place: in the order of the pools, which is that of first use, so that a frame needs few
 /// slabs. A shape lies where the first brick that uses it would.
 pub fn place(allocations: &[&Allocation]) -> Layout {
-    let mut planned = Codec::WITH_TEXELS.map(|codec| PlannedAtlas {
-        atlas: plan(codec, 0),
-        texels: Vec::new(),
-        grids: Vec::new(),
-    });
+    // For each codec what lies in its slots, and the first slot of each grid.
+    let mut taken: [(Vec<u32>, Vec<u32>); Codec::WITH_TEXELS.len()] = Default::default();
     let mut slots = Vec::new();
     for allocation in allocations {
-        planned.iter_mut().for_each(|p| p.grids.push(p.texels.len() as u32));
+        taken.iter_mut().for_each(|(texels, grids)| grids.push(texels.len() as u32));
         let mut put = |codec: Codec, of: u32| {
-            let texels = &mut planned[codec as usize - 1].texels;
+            let (texels, _) = &mut taken[codec as usize - 1];
             texels.push(of);
             texels.len() as u32 - 1
         };
@@ -94,10 +91,12 @@ pub fn place(allocations: &[&Allocation]) -> Layout {
         };
         slots.push(allocation.codings.iter().enumerate().map(place).collect());
     }
-    for (codec, planned) in Codec::WITH_TEXELS.into_iter().zip(&mut planned) {
-        planned.atlas = plan(codec, planned.texels.len() as u32);
-    }
-    Layout { atlases: planned.into_iter().filter(|a| a.atlas.bricks > 0).collect(), slots }
+    let planned = Codec::WITH_TEXELS.into_iter().zip(taken).map(|(codec, (texels, grids))| PlannedAtlas {
+        atlas: plan(codec, texels.len() as u32),
+        texels,
+        grids,
+    });
+    Layout { atlases: planned.filter(|a| a.atlas.bricks > 0).collect(), slots }
 }
 
 /// Bricks across a page at most.

@@ -12,16 +12,13 @@ use volpack::settings::{Format, Settings};
 use volpack::vdb::VdbFile;
 
 use crate::measured::median;
-use crate::{peers, scale};
+use crate::peers;
+use crate::scale::Sequences;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// The frames of a short sequence
-    #[arg(required = true)]
-    files: Vec<PathBuf>,
-    /// How many times as long the long one is
-    #[arg(long, default_value_t = 10)]
-    repeats: usize,
+    #[command(flatten)]
+    sequences: Sequences,
     /// How often each load is timed; the median counts
     #[arg(long, default_value_t = 25)]
     rounds: usize,
@@ -32,9 +29,8 @@ pub struct Args {
 
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     let folder = tempfile::tempdir()?;
-    let files = volpack::manifest::expand(&args.files)?;
-    let long = scale::repeated(&files, args.repeats, folder.path())?;
-    let short = &long[..files.len()];
+    let (long, short) = args.sequences.make(folder.path())?;
+    let short = &long[..short];
     let mut rows = Vec::new();
     println!(
         "{} and {} frames, {} threads, medians\n",

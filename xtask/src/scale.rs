@@ -11,12 +11,8 @@ use crate::peers;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// The frames of a short sequence
-    #[arg(required = true)]
-    files: Vec<PathBuf>,
-    /// How many times as long the long one is
-    #[arg(long, default_value_t = 10)]
-    repeats: usize,
+    #[command(flatten)]
+    sequences: Sequences,
     /// How often each build is measured, in turns; the median counts
     #[arg(long, default_value_t = 5)]
     rounds: usize,
@@ -39,16 +35,15 @@ const LEAST_USE: f64 = 0.85;
 
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     let folder = tempfile::tempdir()?;
-    let files = volpack::manifest::expand(&args.files)?;
-    let long = repeated(&files, args.repeats, folder.path())?;
-    let short = &long[..files.len()];
+    let (long, short) = args.sequences.make(folder.path())?;
+    let short = &long[..short];
     let cores = std::thread::available_parallelism()?.get() as f64;
     let output = folder.path().join("bench.volpack");
     let mut rows = Vec::new();
     println!("{} and {} frames, {cores} cores\n", short.len(), long.len());
     println!(
         "| build | short s | long s | ratio / {} | short MiB | long MiB | ratio | long: cores in use |",
-        args.repeats
+        args.sequences.repeats
     );
     println!("|---|---|---|---|---|---|---|---|");
     for options in CASES {
@@ -64,7 +59,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
         let (short_mib, long_mib) = of(|run| run.peak_mib);
         let usage = median(longs.iter().map(|run| run.cpu_seconds / run.seconds)) / cores;
         let verdict = |met: bool| if met { "met" } else { "**missed**" };
-        let (time, memory) = (long_s / short_s / args.repeats as f64, long_mib / short_mib);
+        let (time, memory) = (long_s / short_s / args.sequences.repeats as f64, long_mib / short_mib);
         println!(
             "| {} | {short_s:.3} | {long_s:.3} | {time:.2} ({}) | {short_mib:.1} | {long_mib:.1} | {memory:.2} ({}) | {:.0} % ({}) |",
             options[1],
@@ -81,18 +76,33 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     )
 }
 
-/// The files of a sequence that is `repeats` times as long: each repeat is moved and scaled so that nothing in it is
-/// in another.
-///
-/// # Errors
-/// When OpenVDB is not installed.
-pub fn repeated(files: &[PathBuf], repeats: usize, folder: &Path) -> Result<Vec<PathBuf>, Box<dyn Error>> {
-    let program = peers::compile_openvdb("benches/peers/repeat_openvdb.cpp")?;
-    let frames = folder.join("frames");
-    std::fs::create_dir(&frames)?;
-    let status = Command::new(program).arg(&frames).arg(repeats.to_string()).args(files).status()?;
-    if !status.success() {
-        return Err("the long sequence could not be made".into());
+/// A short sequence and a long one made of it.
+#[derive(clap::Args)]
+pub struct Sequences {
+    /// The frames of a short sequence
+    #[arg(required = true)]
+    files: Vec<PathBuf>,
+    /// How many times as long the long one is
+    #[arg(long, default_value_t = 10)]
+    repeats: usize,
+}
+
+impl Sequences {
+    /// The files of the long one, and how many of them are the short one. Each repeat is moved and scaled so that nothing
+    /// in it is in another.
+    ///
+    /// # Errors
+    /// When OpenVDB is not installed.
+    pub fn make(&self, folder: &Path) -> Result<(Vec<PathBuf>, usize), Box<dyn Error>> {
+        let files = volpack::manifest::expand(&self.files)?;
+        let program = peers::compile_openvdb("benches/peers/repeat_openvdb.cpp")?;
+        let frames = folder.join("frames");
+        std::fs::create_dir(&frames)?;
+        let status =
+            Command::new(program).arg(&frames).arg(self.repeats.to_string()).args(&files).status()?;
+        if !status.success() {
+            return Err("the long sequence could not be made".into());
+        }
+        Ok((volpack::manifest::expand(&[frames.join("*.vdb")])?, files.len()))
     }
-    Ok(volpack::manifest::expand(&[frames.join("*.vdb")])?)
 }

@@ -5,7 +5,7 @@ use ndarray::ArrayView2;
 use rayon::prelude::*;
 
 use super::kmeans::{KMeansSettings, kmeans};
-use super::{AllocateError, Allocation, Coding, Shape, uniform};
+use super::{AllocateError, Allocation, Coding, Shape, uniform, windows};
 use crate::codec::{BrickRange, Codec, SequenceRange, Texels, decode, encode};
 use crate::settings::{Clustering, RangeMode};
 use crate::stages::dedup::{SequenceTree, carried};
@@ -27,8 +27,7 @@ pub fn clustered(
     let mut allocation = uniform(tree, encodings, codec);
     let sequence = allocation.sequence;
     let (mut ids, mut points) = (Vec::new(), Vec::new());
-    for first in (0..tree.pool.len()).step_by(BRICKS_IN_FLIGHT as usize) {
-        let window: Vec<u32> = (first..(first + BRICKS_IN_FLIGHT).min(tree.pool.len())).collect();
+    for window in windows(tree.pool.len(), BRICKS_IN_FLIGHT) {
         tree.fetch(&window)?;
         let bricks = tree.pool.read(&window)?;
         for (id, brick) in window.into_iter().zip(&bricks) {

@@ -118,6 +118,11 @@ impl Allocation {
     }
 }
 
+/// The numbers of all bricks, so many at a time.
+fn windows(bricks: u32, size: u32) -> impl Iterator<Item = Vec<u32>> {
+    (0..bricks).step_by(size as usize).map(move |first| (first..(first + size).min(bricks)).collect())
+}
+
 /// Gives every brick of `tree` one codec.
 pub fn uniform(tree: &SequenceTree, encodings: Encodings, codec: Codec) -> Allocation {
     let bricks = tree.pool.len() as usize;

@@ -13,7 +13,7 @@ use super::adaptive::AdaptiveGrid;
 use super::choices::{BLOCK, Choices, Table, Weighed, costs};
 use super::rung::Rung;
 use super::share::{Loan, loans};
-use super::{Allocation, Coding, Shape};
+use super::{Allocation, Coding, Shape, windows};
 use crate::stages::dedup::{FrameTree, Payload, SequenceTree};
 use crate::stages::encodings::{Cost, Encodings, KeptCodec, Kind, Tried};
 use crate::trace;
@@ -84,7 +84,7 @@ impl<'a> GridSearch<'a> {
             encodings: grid.encodings,
             tree,
         };
-        for ids in windows(uses.len() as u32) {
+        for ids in windows(uses.len() as u32, BLOCK) {
             let costs = costs(&search.encodings, &ids, &search.bc7_is_tried)?;
             let choices = |&id: &u32| Choices::new(uses[id as usize], records[id as usize]);
             search.table.add(ids.iter().map(choices).zip(costs.into_iter().map(|(costs, _)| costs)))?;
@@ -279,7 +279,7 @@ impl<'a> GridSearch<'a> {
         let fits = |cost: &Cost| cost.norm.is_finite() && f64::from(cost.max) <= bound;
         loop {
             let mut picks = Vec::with_capacity(self.table.len() as usize);
-            for ids in windows(self.table.len()) {
+            for ids in windows(self.table.len(), BLOCK) {
                 let costs = costs(&self.encodings, &ids, &self.bc7_is_tried)?;
                 picks.extend(costs.iter().map(|(costs, _)| {
                     Rung::ALL.into_iter().find(|&rung| fits(&costs[rung as usize])).unwrap_or(Rung::F32)
@@ -390,7 +390,7 @@ impl<'a> GridSearch<'a> {
         let Self { tree, encodings, bc7_is_tried, table, .. } = self;
         let loans = table.into_loans();
         let (mut norms, mut codings) = (Vec::with_capacity(picks.len()), Vec::with_capacity(picks.len()));
-        for ids in windows(picks.len() as u32) {
+        for ids in windows(picks.len() as u32, BLOCK) {
             for (&id, (costs, value)) in ids.iter().zip(costs(&encodings, &ids, &bc7_is_tried)?) {
                 let rung = picks[id as usize];
                 norms.push(
@@ -430,11 +430,6 @@ impl<'a> GridSearch<'a> {
         tree.prune(is_empty);
         Ok(allocation)
     }
-}
-
-/// All bricks, as many at a time as are looked at together.
-fn windows(bricks: u32) -> impl Iterator<Item = Vec<u32>> {
-    (0..bricks).step_by(BLOCK as usize).map(move |first| (first..(first + BLOCK).min(bricks)).collect())
 }
 
 /// The first step, of 0 to [`LAST_STEP`], that meets what every finer one meets too; the last if none does. Near a step

@@ -332,7 +332,10 @@ impl Encodings {
                 let notes: Vec<_> = tried.costs.iter().zip(&tried.axes).map(note).collect();
                 self.kept[codec as usize].add(self.rules.len(), ids, &notes, &tried.bytes)
             }
-            Made::Plain(plain) => self.keep_plain(ids, &plain),
+            Made::Plain(plain) => {
+                let notes: Vec<_> = plain.into_iter().map(Plain::to_notes).collect();
+                self.plain.add(self.rules.len(), ids, &notes, &[])
+            }
         }
     }
 
@@ -340,11 +343,6 @@ impl Encodings {
     fn flush(&mut self) -> io::Result<()> {
         self.plain.flush()?;
         self.kept.iter_mut().try_for_each(Kept::flush)
-    }
-
-    fn keep_plain(&mut self, ids: &[u32], plain: &[Plain]) -> io::Result<()> {
-        let notes: Vec<_> = plain.iter().copied().map(Plain::to_notes).collect();
-        self.plain.add(self.rules.len(), ids, &notes, &[])
     }
 }
 

@@ -151,13 +151,7 @@ pub fn serialise(
     writer.section(bytemuck::cast_slice(&lists), level)?;
     writer.section(&provenance, level)?;
     writer.section(bytemuck::cast_slice(&frames), level)?;
-    writer.begin()?;
-    let mut words = words.words(grids, &layout, &outcomes).peekable();
-    while words.peek().is_some() {
-        let chunk: Vec<u32> = words.by_ref().take(CHUNK_BYTES as usize / 4).collect();
-        let encoding = encoding(kind::TREE, 0);
-        writer.chunk(&compress_chunk(bytemuck::cast_slice(&chunk).to_vec(), encoding, level)?)?;
-    }
+    writer.words(words.words(grids, &layout, &outcomes), level)?;
     Ok(writer.finish()?)
 }
 
