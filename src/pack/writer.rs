@@ -4,6 +4,7 @@ use std::fs::File;
 use std::io::{self, BufWriter, Seek, SeekFrom, Write};
 use std::path::{Path, PathBuf};
 
+use rayon::prelude::*;
 use tempfile::NamedTempFile;
 
 use crate::aside::{LEFT_BEHIND, folder_of, is_temporary, make_readable};
@@ -152,12 +153,8 @@ impl PackWriter {
     /// # Errors
     /// When the file cannot be written.
     pub fn section(&mut self, raw: &[u8], level: i32) -> io::Result<()> {
-        self.begin()?;
-        let spec = self.specs[self.sections.len() - 1];
-        for chunk in raw.chunks(spec.chunk_bytes as usize) {
-            self.chunk(&compress_chunk(chunk.to_vec(), spec.encoding, level)?)?;
-        }
-        Ok(())
+        let chunk_bytes = self.specs[self.sections.len()].chunk_bytes as usize;
+        self.compressed(raw.chunks(chunk_bytes).map(<[u8]>::to_vec), level)
     }
 
     /// The same for words that are made as they are written.
@@ -165,14 +162,31 @@ impl PackWriter {
     /// # Errors
     /// When the file cannot be written.
     pub fn words(&mut self, words: impl Iterator<Item = u32>, level: i32) -> io::Result<()> {
-        self.begin()?;
-        let spec = self.specs[self.sections.len() - 1];
+        let chunk_words = self.specs[self.sections.len()].chunk_bytes as usize / 4;
         let mut words = words.peekable();
-        while words.peek().is_some() {
-            let chunk: Vec<u32> = words.by_ref().take(spec.chunk_bytes as usize / 4).collect();
-            self.chunk(&compress_chunk(bytemuck::cast_slice(&chunk).to_vec(), spec.encoding, level)?)?;
+        let chunk = || {
+            words.peek()?;
+            let mut chunk = Vec::with_capacity(chunk_words * 4);
+            words.by_ref().take(chunk_words).for_each(|word| chunk.extend_from_slice(&word.to_le_bytes()));
+            Some(chunk)
+        };
+        self.compressed(std::iter::from_fn(chunk), level)
+    }
+
+    /// Begins a section and writes its chunks, which are encoded side by side.
+    fn compressed(&mut self, mut chunks: impl Iterator<Item = Vec<u8>>, level: i32) -> io::Result<()> {
+        let encoding = self.specs[self.sections.len()].encoding;
+        self.begin()?;
+        loop {
+            let group: Vec<Vec<u8>> = chunks.by_ref().take(rayon::current_num_threads()).collect();
+            if group.is_empty() {
+                return Ok(());
+            }
+            let group = group.into_par_iter().map(|raw| compress_chunk(raw, encoding, level));
+            for chunk in group.collect::<io::Result<Vec<_>>>()? {
+                self.chunk(&chunk)?;
+            }
         }
-        Ok(())
     }
 
     /// Fills in the tables and syncs. The file is whole then, but not yet in its place.

@@ -1,14 +1,14 @@
 //! Stage 7: texels to the bytes of a codec, slab by slab.
 
-use std::{io, mem};
+use std::io;
 
 use rayon::prelude::*;
 
 use super::allocate::{Allocation, Coding};
 use super::dedup::SequenceTree;
 use super::encodings::{KeptCodec, Kind, Tried};
-use super::relayout::{self, PlannedAtlas, Texture, TextureOf};
-use crate::codec::{Codec, OutOfRange, Texels, decode, encode};
+use super::relayout::{self, Cursor, Layout, Texture, TextureOf};
+use crate::codec::{self, Codec, OutOfRange, Texels, decode, encode};
 use crate::pack::Atlas;
 use crate::trace;
 use crate::volume::Brick;
@@ -39,29 +39,34 @@ pub enum QuantiseError {
 
 /// What became of each brick of a grid.
 pub struct Outcome {
-    /// Its packing axis.
-    pub axes: Vec<u8>,
-    /// The root of the squared error over the voxels that its texels give, on the decoded value.
-    pub norms: Vec<f64>,
+    /// Its packing axis, where it has texels of its own.
+    axes: Vec<u8>,
 }
 
 impl Outcome {
-    /// What is known before any slab is encoded: constants and shapes. Their norms are here from now on.
-    pub fn before(allocation: &mut Allocation) -> Self {
-        let axis = |coding: &Coding| match *coding {
+    /// What is known before any slab is encoded.
+    pub fn before(allocation: &Allocation) -> Self {
+        Self { axes: vec![2; allocation.len() as usize] }
+    }
+
+    /// The packing axis of the texels that a brick reads.
+    pub fn axis(&self, allocation: &Allocation, brick: u32) -> u8 {
+        match allocation.coding(brick) {
+            Coding::Borrowed(lender) => self.axes[lender as usize],
             Coding::Shared(shape) => allocation.shapes[shape as usize].axis,
-            _ => 2,
-        };
-        Self { axes: allocation.codings.iter().map(axis).collect(), norms: mem::take(&mut allocation.norms) }
+            _ => self.axes[brick as usize],
+        }
     }
 }
 
-/// One brick's texels, encoded.
+/// Some texels, encoded.
+#[derive(Default)]
 struct Encoded {
+    /// One brick's after another's.
     bytes: Vec<u8>,
-    axis: u8,
-    /// Root of the squared error; `None` where it was known before.
-    norm: Option<f64>,
+    axes: Vec<u8>,
+    /// Roots of squared errors; 0 for shapes, which have none.
+    norms: Vec<f64>,
 }
 
 /// A slab of an atlas, and what lies in it.
@@ -73,28 +78,33 @@ struct Slab<'a> {
 
 /// Encodes every slab of every atlas in order. `finish` is applied to a slab's bytes on the thread that made
 /// them, `sink` to the results in order, each with its atlas and its place there. What becomes of each grid's bricks
-/// goes into `outcomes`.
+/// goes into `outcomes`, and their errors, where they were not known, to those of their allocation.
 ///
 /// # Errors
 /// [`QuantiseError`].
 pub fn quantise<T: Send>(
-    atlases: &[PlannedAtlas],
+    layout: &Layout,
     grids: &mut [GridBricks],
     outcomes: &mut [Outcome],
     finish: impl Fn(&Atlas, Vec<u8>) -> io::Result<T> + Sync,
     mut sink: impl FnMut(&Atlas, u32, T) -> io::Result<()>,
 ) -> Result<(), QuantiseError> {
-    let slabs = atlases.iter().flat_map(|planned| (0..planned.atlas.slabs).map(move |slab| (planned, slab)));
-    let mut slabs = slabs.map(|(planned, place)| {
-        let atlas = &planned.atlas;
-        Slab { atlas, place, textures: planned.textures(atlas.slots(place)) }
-    });
+    let mut slabs = layout.atlases.iter().flat_map(|atlas| (0..atlas.slabs).map(move |slab| (atlas, slab)));
+    let mut cursor = Cursor::default();
     loop {
         crate::interrupt::check().map_err(io::Error::from)?;
-        // Two a thread: one of them may take longer than another.
-        let group: Vec<Slab> = slabs.by_ref().take(2 * rayon::current_num_threads()).collect();
+        let allocations: Vec<&Allocation> = grids.iter().map(|grid| &*grid.allocation).collect();
+        let slab = |(atlas, place)| {
+            if place == 0 {
+                cursor = Cursor::default();
+            }
+            Slab { atlas, place, textures: layout.textures(&allocations, atlas, place, &mut cursor) }
+        };
+        // Some a thread: one of them may take longer than another.
+        let group: Vec<Slab> =
+            slabs.by_ref().take(AT_ONCE * rayon::current_num_threads()).map(slab).collect();
         if group.is_empty() {
-            return Ok(());
+            break;
         }
         for slabs in group.chunk_by(|a, b| a.atlas.codec == b.atlas.codec) {
             let textures: Vec<Texture> = slabs.iter().flat_map(|slab| &slab.textures).copied().collect();
@@ -105,23 +115,29 @@ pub fn quantise<T: Send>(
             .par_iter()
             .map(|slab| {
                 let _span = trace::span("quantise");
-                let encoded = encode_slab(shared, slab)?;
-                let bytes: Vec<u8> = encoded.iter().flat_map(|e| &e.bytes).copied().collect();
-                Ok((finish(slab.atlas, relayout::assemble(slab.atlas, &bytes))?, encoded))
+                let Encoded { bytes, axes, norms } = encode_slab(shared, slab)?;
+                Ok((finish(slab.atlas, relayout::assemble(slab.atlas, &bytes))?, axes, norms))
             })
             .collect::<Result<_, QuantiseError>>()?;
-        for ((bytes, encoded), slab) in encoded.into_iter().zip(&group) {
+        for ((bytes, axes, norms), slab) in encoded.into_iter().zip(&group) {
             sink(slab.atlas, slab.place, bytes)?;
-            for (texture, encoded) in slab.textures.iter().zip(encoded) {
-                if let TextureOf::Brick(id) = texture.of {
-                    let outcome = &mut outcomes[texture.grid as usize];
-                    outcome.axes[id as usize] = encoded.axis;
-                    encoded.norm.into_iter().for_each(|norm| outcome.norms[id as usize] = norm);
+            for ((texture, axis), norm) in slab.textures.iter().zip(axes).zip(norms) {
+                let Some(id) = texture.brick() else { continue };
+                let grid = texture.grid as usize;
+                outcomes[grid].axes[id as usize] = axis;
+                let all = &mut grids[grid].allocation.norms;
+                if !all.are_known {
+                    all.put(id, &[norm])?;
                 }
             }
         }
     }
+    grids.iter_mut().try_for_each(|grid| grid.allocation.norms.flush())?;
+    Ok(())
 }
+
+/// Slabs that are worked on together, for each thread.
+const AT_ONCE: usize = 2;
 
 /// Sees to it that the texels of some slots, which are kept, or else their bricks can be read.
 fn prepare(grids: &mut [GridBricks], codec: Codec, textures: &[Texture]) -> io::Result<()> {
@@ -136,37 +152,45 @@ fn prepare(grids: &mut [GridBricks], codec: Codec, textures: &[Texture]) -> io::
     Ok(())
 }
 
-fn encode_slab(grids: &[GridBricks], slab: &Slab) -> Result<Vec<Encoded>, QuantiseError> {
+fn encode_slab(grids: &[GridBricks], slab: &Slab) -> Result<Encoded, QuantiseError> {
     let codec = slab.atlas.codec;
     let together = |a: &Texture, b: &Texture| a.grid == b.grid && a.brick().is_some() && b.brick().is_some();
-    let mut out = Vec::with_capacity(slab.textures.len());
+    let mut all = Encoded::default();
     for run in slab.textures.chunk_by(together) {
         let grid = run[0].grid as usize;
         let GridBricks { tree, allocation } = &grids[grid];
         if let TextureOf::Shape(shape) = run[0].of {
             let shape = &allocation.shapes[shape as usize];
-            out.push(Encoded { bytes: shape.bytes.clone(), axis: shape.axis, norm: None });
+            all.add(Encoded { bytes: shape.bytes.clone(), axes: vec![shape.axis], norms: vec![0.0] });
             continue;
         }
         let ids: Vec<u32> = run.iter().filter_map(Texture::brick).collect();
-        match KeptCodec::of(codec) {
+        all.add(match KeptCodec::of(codec) {
             Some(kept) => {
                 let Tried { costs, bytes, axes } = allocation.encodings.texels(&ids, kept)?;
-                let each = bytes.chunks_exact(codec.layout().brick_bytes()).zip(costs).zip(axes);
-                out.extend(each.map(|((bytes, cost), axis)| Encoded {
-                    bytes: bytes.to_vec(),
-                    axis,
-                    norm: Some(cost.norm),
-                }));
+                Encoded { bytes, axes, norms: costs.iter().map(|cost| cost.norm).collect() }
             }
             None => {
                 let bricks = tree.pool.read(&ids)?;
                 let encoded = encode_bricks(codec, &grids[grid], &ids, &bricks);
-                out.extend(encoded.map_err(|source| QuantiseError::OutOfRange { grid, source })?);
+                encoded.map_err(|source| QuantiseError::OutOfRange { grid, source })?
             }
-        }
+        });
     }
-    Ok(out)
+    Ok(all)
+}
+
+impl Encoded {
+    /// Appends what comes after. What is alone, as most is, is not copied.
+    fn add(&mut self, next: Self) {
+        if self.axes.is_empty() {
+            *self = next;
+            return;
+        }
+        self.bytes.extend_from_slice(&next.bytes);
+        self.axes.extend(next.axes);
+        self.norms.extend(next.norms);
+    }
 }
 
 fn encode_bricks(
@@ -174,22 +198,20 @@ fn encode_bricks(
     grid: &GridBricks,
     ids: &[u32],
     bricks: &[Brick],
-) -> Result<Vec<Encoded>, OutOfRange> {
+) -> Result<Encoded, OutOfRange> {
     let sequence = &grid.allocation.sequence;
     let encodings = &grid.allocation.encodings;
     let texels: Vec<Texels> =
         ids.iter().zip(bricks).map(|(&id, brick)| encodings.prepare(grid.tree, id, brick)).collect();
-    let encoded = encode(codec, sequence, &texels)?;
-    let size = codec.layout().brick_bytes();
-    let each = bricks.iter().zip(&texels).zip(encoded.bytes.chunks_exact(size)).zip(encoded.axes);
-    let encoded = each.map(|(((brick, texels), bytes), axis)| {
-        let norm = if codec == Codec::F32 {
-            0.0
-        } else {
+    let codec::Encoded { bytes, axes } = encode(codec, sequence, &texels)?;
+    let each = bricks.iter().zip(&texels).zip(bytes.chunks_exact(codec.layout().brick_bytes())).zip(&axes);
+    let norm = |(((brick, texels), bytes), &axis): (((&Brick, &Texels), &[u8]), &u8)| match codec {
+        Codec::F32 => 0.0,
+        _ => {
             let decoded = decode(codec, bytes, axis, sequence, texels.range);
             brick.error_norm(&decoded, &texels.carried)
-        };
-        Encoded { bytes: bytes.to_vec(), axis, norm: Some(norm) }
-    });
-    Ok(encoded.collect())
+        }
+    };
+    let norms = each.map(norm).collect();
+    Ok(Encoded { bytes, axes, norms })
 }

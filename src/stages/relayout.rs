@@ -1,7 +1,5 @@
 //! Stage 6: where each brick lies in the pages of the codecs' 3-D textures.
 
-use std::ops::Range;
-
 use super::allocate::{Allocation, Coding};
 use crate::codec::Codec;
 use crate::pack::{Atlas, MAX_TEXELS};
@@ -9,37 +7,12 @@ use crate::pack::{Atlas, MAX_TEXELS};
 /// Where every brick of a pack lies.
 pub struct Layout {
     /// The atlases that have a brick, by their codecs' tags.
-    pub atlases: Vec<PlannedAtlas>,
-    /// For each grid, the slot of each brick of its pool in its codec's atlas; 0 for constants.
-    pub slots: Vec<Vec<u32>>,
+    pub atlases: Vec<Atlas>,
+    /// For each grid, the slot of each brick of its pool in its codec's atlas; [`NO_SLOT`] for constants.
+    slots: Vec<Vec<u32>>,
 }
 
-/// One codec's atlas and what goes where.
-pub struct PlannedAtlas {
-    /// Its geometry.
-    pub atlas: Atlas,
-    /// For each slot a brick of its grid's pool or, with [`SHAPE`], one of the grid's shapes.
-    texels: Vec<u32>,
-    /// Each grid's first slot.
-    grids: Vec<u32>,
-}
-
-/// The bit of what is no brick.
-const SHAPE: u32 = 1 << 31;
-
-impl PlannedAtlas {
-    /// What lies in some slots.
-    pub fn textures(&self, slots: Range<u32>) -> Vec<Texture> {
-        let texture = |slot: u32| {
-            let of = match self.texels[slot as usize] {
-                shape if shape & SHAPE != 0 => TextureOf::Shape(shape & !SHAPE),
-                brick => TextureOf::Brick(brick),
-            };
-            Texture { grid: self.grids.partition_point(|first| *first <= slot) as u32 - 1, of }
-        };
-        slots.map(texture).collect()
-    }
-}
+const NO_SLOT: u32 = u32::MAX;
 
 /// What lies in a slot.
 #[derive(Clone, Copy, Debug)]
@@ -69,34 +42,79 @@ pub enum TextureOf {
     Shape(u32),
 }
 
+/// How far the slots of an atlas were looked through: the grid and the brick to go on from.
+#[derive(Clone, Copy, Default)]
+pub struct Cursor {
+    grid: usize,
+    brick: u32,
+}
+
 /// Gives each brick its place: in the order of the pools, which is that of first use, so that a frame needs few
-/// slabs. A shape lies where the first brick that uses it would.
+/// slabs. Texels that several bricks read lie where the first of those would.
 pub fn place(allocations: &[&Allocation]) -> Layout {
-    // For each codec what lies in its slots, and the first slot of each grid.
-    let mut taken: [(Vec<u32>, Vec<u32>); Codec::WITH_TEXELS.len()] = Default::default();
-    let mut slots = Vec::new();
-    for allocation in allocations {
-        taken.iter_mut().for_each(|(texels, grids)| grids.push(texels.len() as u32));
-        let mut put = |codec: Codec, of: u32| {
-            let (texels, _) = &mut taken[codec as usize - 1];
-            texels.push(of);
-            texels.len() as u32 - 1
+    let mut counts = [0; Codec::WITH_TEXELS.len() + 1];
+    let slots = allocations.iter().map(|allocation| slots(allocation, &mut counts)).collect();
+    let planned = Codec::WITH_TEXELS.into_iter().map(|codec| plan(codec, counts[codec as usize]));
+    Layout { atlases: planned.filter(|atlas| atlas.bricks > 0).collect(), slots }
+}
+
+/// The slot of each brick of a grid. `counts` are those that each codec has so far, by its tag.
+fn slots(allocation: &Allocation, counts: &mut [u32]) -> Vec<u32> {
+    let mut slots = vec![NO_SLOT; allocation.len() as usize];
+    let mut of_shapes = vec![NO_SLOT; allocation.shapes.len()];
+    for id in 0..allocation.len() {
+        let slot = match allocation.coding(id) {
+            Coding::Empty | Coding::Constant(_) => continue,
+            Coding::Own(_) => &mut slots[id as usize],
+            Coding::Borrowed(lender) => &mut slots[lender as usize],
+            Coding::Shared(shape) => &mut of_shapes[shape as usize],
         };
-        let mut shapes: Vec<Option<u32>> = vec![None; allocation.shapes.len()];
-        let place = |(id, coding): (usize, &Coding)| match *coding {
-            Coding::Empty | Coding::Constant(_) => 0,
-            Coding::Own(codec) => put(codec, id as u32),
-            Coding::Shared(shape) => *shapes[shape as usize]
-                .get_or_insert_with(|| put(allocation.shapes[shape as usize].codec, shape | SHAPE)),
-        };
-        slots.push(allocation.codings.iter().enumerate().map(place).collect());
+        if *slot == NO_SLOT {
+            let count = &mut counts[allocation.codec(id) as usize];
+            *slot = *count;
+            *count += 1;
+        }
+        slots[id as usize] = *slot;
     }
-    let planned = Codec::WITH_TEXELS.into_iter().zip(taken).map(|(codec, (texels, grids))| PlannedAtlas {
-        atlas: plan(codec, texels.len() as u32),
-        texels,
-        grids,
-    });
-    Layout { atlases: planned.filter(|a| a.atlas.bricks > 0).collect(), slots }
+    slots
+}
+
+impl Layout {
+    /// The slot of a brick that has texels.
+    pub fn slot(&self, grid: usize, brick: u32) -> u32 {
+        self.slots[grid][brick as usize]
+    }
+
+    /// What lies in a slab of an atlas, slot by slot. Slabs are asked for in order, from a new cursor on.
+    pub fn textures(
+        &self,
+        allocations: &[&Allocation],
+        atlas: &Atlas,
+        slab: u32,
+        cursor: &mut Cursor,
+    ) -> Vec<Texture> {
+        let slots = atlas.slots(slab);
+        let mut textures = Vec::with_capacity(slots.len());
+        while textures.len() < slots.len() {
+            let Cursor { grid, brick: id } = *cursor;
+            if id == allocations[grid].len() {
+                *cursor = Cursor { grid: grid + 1, brick: 0 };
+                continue;
+            }
+            cursor.brick += 1;
+            // A slot is that of the first brick that has it: those after it only read it.
+            let next = slots.start + textures.len() as u32;
+            if self.slots[grid][id as usize] == next && allocations[grid].codec(id) == atlas.codec {
+                let of = match allocations[grid].coding(id) {
+                    Coding::Shared(shape) => TextureOf::Shape(shape),
+                    Coding::Borrowed(lender) => TextureOf::Brick(lender),
+                    _ => TextureOf::Brick(id),
+                };
+                textures.push(Texture { grid: grid as u32, of });
+            }
+        }
+        textures
+    }
 }
 
 /// Bricks across a page at most.

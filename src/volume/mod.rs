@@ -9,6 +9,7 @@ mod list;
 mod mask;
 mod pool;
 mod scratch;
+mod sparse;
 
 pub use brick::{BRICK_VOXELS, Brick, InactiveRule};
 pub use coord::{BRICK_DIM, CELL_DIM, Coord, CoordBox, ROOT_DIM};
@@ -17,3 +18,4 @@ pub use list::List;
 pub use mask::{Mask512, bits};
 pub use pool::{BRICKS_IN_FLIGHT, BrickPool, Interner};
 pub use scratch::{SCRATCH_HEAD, Scratch};
+pub use sparse::Sparse;

@@ -5,7 +5,6 @@ use std::io;
 
 use bytemuck::{Pod, Zeroable};
 use hashbrown::HashTable;
-use hashbrown::hash_table::Entry;
 use xxhash_rust::xxh3::{xxh3_64, xxh3_128};
 
 use super::{BRICK_VOXELS, Brick, List, Mask512, SCRATCH_HEAD, Scratch};
@@ -15,34 +14,44 @@ pub const BRICKS_IN_FLIGHT: u32 = 4096;
 
 /// Stores bricks so that equal ones are kept once, and gives them back by number.
 ///
-/// A brick may be known before its values are: they are put in when someone has need of them. Memory is 6 bytes a
-/// unique brick, and 30 to 40 more until [`BrickPool::seal`]; voxels, masks and digests are in scratch files.
+/// A brick may be known before its values are: they are put in when someone has need of them. Memory is 4 bytes a
+/// unique brick, and 15 to 20 more until [`BrickPool::seal`]; voxels, masks and digests are in scratch files.
 pub struct BrickPool {
     by_digest: HashTable<u32>,
-    digests: List<Key>,
-    /// Hashes of the active masks.
-    actives: List<u64>,
-    /// The place of each among the bricks of the frame that had it first.
-    places: List<u32>,
-    flags: List<Flags>,
+    /// The first bytes of each digest. The rest of it is looked at where these are the same.
+    starts: List<u64>,
+    bricks: List<Known>,
     facts: Scratch,
     values: Scratch,
 }
 
-/// Half of a digest tells bricks apart as well: nobody has ever found two texts of one either, and while frames are
-/// added the table is the largest thing that grows with them.
-type Key = [u8; 16];
-
 /// A digest is its own hash.
-fn start(key: &Key) -> u64 {
-    u64::from_ne_bytes(*key.first_chunk().expect("a key is 16 bytes"))
+fn start(digest: &[u8; 32]) -> u64 {
+    u64::from_ne_bytes(*digest.first_chunk().expect("a digest is 32 bytes"))
 }
 
+/// What is known of a brick in a word: its place among the bricks of the frame that had it first, of which no frame has
+/// 2^30, and two flags.
 #[derive(Clone, Copy)]
-struct Flags {
-    keeps_mask: bool,
+struct Known(u32);
+
+impl Known {
+    const KEEPS_MASK: u32 = 1 << 31;
     /// Whether its values were put in.
-    is_there: bool,
+    const IS_THERE: u32 = 1 << 30;
+
+    fn new(place: u32, keeps_mask: bool) -> Self {
+        assert!(place < Self::IS_THERE, "a frame's bricks are fewer than 2^30");
+        Self(place | if keeps_mask { Self::KEEPS_MASK } else { 0 })
+    }
+
+    fn place(self) -> u32 {
+        self.0 & !(Self::KEEPS_MASK | Self::IS_THERE)
+    }
+
+    fn is(self, flag: u32) -> bool {
+        self.0 & flag != 0
+    }
 }
 
 /// What is asked of a brick together with its values.
@@ -61,10 +70,8 @@ impl Default for BrickPool {
     fn default() -> Self {
         Self {
             by_digest: HashTable::new(),
-            digests: List::default(),
-            actives: List::default(),
-            places: List::default(),
-            flags: List::default(),
+            starts: List::default(),
+            bricks: List::default(),
             facts: Scratch::new(size_of::<Facts>(), SCRATCH_HEAD),
             values: Scratch::new(BRICK_VOXELS * 4, 0),
         }
@@ -74,12 +81,12 @@ impl Default for BrickPool {
 impl BrickPool {
     /// How many unique bricks there are.
     pub fn len(&self) -> u32 {
-        self.places.len() as u32
+        self.bricks.len() as u32
     }
 
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
-        self.places.is_empty()
+        self.bricks.is_empty()
     }
 
     /// BLAKE3 of what makes a brick: its values, and its mask where that is kept. Two bricks of one digest are one:
@@ -105,33 +112,34 @@ impl BrickPool {
         keeps_mask: bool,
         place: u32,
     ) -> io::Result<(u32, bool)> {
-        let next = self.len();
-        let key: Key = *digest.first_chunk().expect("a digest is 32 bytes");
-        let digests = &self.digests;
-        let known = |id: &u32| digests[*id] == key;
-        let id = match self.by_digest.entry(start(&key), known, |id| start(&digests[*id])) {
-            Entry::Occupied(known) => *known.get(),
-            Entry::Vacant(place) => *place.insert(next).get(),
-        };
-        if id == next {
-            self.digests.push(key);
-            self.places.push(place);
-            self.actives.push(hash(active));
-            self.flags.push(Flags { keeps_mask, is_there: false });
-            self.facts.put(id, bytemuck::bytes_of(&Facts { active: *active, digest: *digest }))?;
-            return Ok((id, true));
+        if let Some((id, mut facts)) = self.find(digest)? {
+            // Without a kept mask bricks are one if their values are. The pool's counts as active what is
+            // active in any of them.
+            let union = facts.active.union(active);
+            if union != facts.active {
+                facts.active = union;
+                self.facts.put(id, bytemuck::bytes_of(&facts))?;
+            }
+            return Ok((id, false));
         }
-        // Without a kept mask bricks are one if their values are. The pool's counts as active what is
-        // active in any of them.
-        let known = &mut self.actives[id];
-        if *known != hash(active) {
-            self.facts.flush()?;
-            let mut facts: Facts = self.facts.read_as(&[id])?[0];
-            facts.active = facts.active.union(active);
-            *known = hash(&facts.active);
-            self.facts.put(id, bytemuck::bytes_of(&facts))?;
+        let (id, start) = (self.len(), start(digest));
+        let starts = &self.starts;
+        self.by_digest.insert_unique(start, id, |id| starts[*id]);
+        self.starts.push(start);
+        self.bricks.push(Known::new(place, keeps_mask));
+        self.facts.put(id, bytemuck::bytes_of(&Facts { active: *active, digest: *digest }))?;
+        Ok((id, true))
+    }
+
+    fn find(&self, digest: &[u8; 32]) -> io::Result<Option<(u32, Facts)>> {
+        let start = start(digest);
+        for &id in self.by_digest.iter_hash(start).filter(|id| self.starts[**id] == start) {
+            let facts: Facts = self.facts.get(id)?;
+            if facts.digest == *digest {
+                return Ok(Some((id, facts)));
+            }
         }
-        Ok((id, false))
+        Ok(None)
     }
 
     /// Forgets what only [`BrickPool::insert`] needs: there will be no more bricks.
@@ -140,8 +148,7 @@ impl BrickPool {
     /// When the scratch file cannot be written.
     pub fn seal(&mut self) -> io::Result<()> {
         self.by_digest = HashTable::new();
-        self.digests = List::default();
-        self.actives = List::default();
+        self.starts = List::default();
         self.facts.flush()?;
         self.values.flush()
     }
@@ -165,12 +172,12 @@ impl BrickPool {
 
     /// Whether a brick's mask is part of what it is.
     pub fn keeps_mask(&self, id: u32) -> bool {
-        self.flags[id].keeps_mask
+        self.bricks[id].is(Known::KEEPS_MASK)
     }
 
     /// The place of a brick among those of the frame that had it first.
     pub fn place(&self, id: u32) -> u32 {
-        self.places[id]
+        self.bricks[id].place()
     }
 
     /// For each of some bricks a hash of which voxels are active, in any of the bricks of the source that it stands for.
@@ -184,7 +191,7 @@ impl BrickPool {
 
     /// Whether a brick's values were put in.
     pub fn is_there(&self, id: u32) -> bool {
-        self.flags[id].is_there
+        self.bricks[id].is(Known::IS_THERE)
     }
 
     /// Puts a brick's values in.
@@ -192,7 +199,7 @@ impl BrickPool {
     /// # Errors
     /// When the scratch file cannot be written.
     pub fn put(&mut self, id: u32, values: &[f32; BRICK_VOXELS]) -> io::Result<()> {
-        self.flags[id].is_there = true;
+        self.bricks[id].0 |= Known::IS_THERE;
         self.values.put(id, bytemuck::bytes_of(values))
     }
 
@@ -206,7 +213,7 @@ impl BrickPool {
         let mut each = ids.iter().zip(facts);
         self.values.read(ids, |values| {
             let (&id, facts) = each.next().expect("each brick has facts and values");
-            let keeps_mask = self.flags[id].keeps_mask;
+            let keeps_mask = self.bricks[id].is(Known::KEEPS_MASK);
             out.push(Brick {
                 values: bytemuck::pod_read_unaligned(values),
                 active: facts.active,

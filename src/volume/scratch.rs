@@ -47,18 +47,18 @@ impl Scratch {
     /// When the file cannot be written.
     pub fn put(&mut self, place: u32, records: &[u8]) -> io::Result<()> {
         debug_assert!(records.len().is_multiple_of(self.record));
-        let count = |bytes: &[u8]| (bytes.len() / self.record) as u32;
-        let (next, end) = (self.buffered + count(&self.buffer), place + count(records));
-        if place != next || records.len() >= BLOCK {
-            self.flush()?;
+        let record = self.record;
+        let count = |bytes: &[u8]| (bytes.len() / record) as u32;
+        if place != self.buffered + count(&self.buffer) || self.buffer.len() + records.len() > BLOCK {
+            self.empty_buffer()?;
             self.buffered = place;
         }
         if records.len() >= BLOCK {
-            self.buffered = end;
+            self.buffered += count(records);
             return self.write(self.at(place), records);
         }
         self.buffer.extend_from_slice(records);
-        if self.buffer.len() >= BLOCK { self.flush() } else { Ok(()) }
+        Ok(())
     }
 
     /// Writes what was put, so that it can be read.
@@ -66,13 +66,20 @@ impl Scratch {
     /// # Errors
     /// When the file cannot be written.
     pub fn flush(&mut self) -> io::Result<()> {
+        self.empty_buffer()?;
+        // There may be nothing more for long.
+        self.buffer = Vec::new();
+        Ok(())
+    }
+
+    fn empty_buffer(&mut self) -> io::Result<()> {
         let mut buffer = std::mem::take(&mut self.buffer);
         if !buffer.is_empty() {
             self.write(self.at(self.buffered), &buffer)?;
             self.buffered += (buffer.len() / self.record) as u32;
             buffer.clear();
-            self.buffer = buffer;
         }
+        self.buffer = buffer;
         Ok(())
     }
 
@@ -156,6 +163,21 @@ impl Scratch {
         Ok(values)
     }
 
+    /// One record as a value, whether it was flushed or not.
+    ///
+    /// # Errors
+    /// When the file cannot be read back.
+    pub fn get<T: Pod>(&self, place: u32) -> io::Result<T> {
+        let mut value = T::zeroed();
+        let record = bytemuck::bytes_of_mut(&mut value);
+        let buffered = place.checked_sub(self.buffered).map(|i| i as usize * self.record);
+        match buffered.and_then(|at| self.buffer.get(at..at + self.record)) {
+            Some(bytes) => record.copy_from_slice(bytes),
+            None => self.load(self.at(place), record)?,
+        }
+        Ok(value)
+    }
+
     fn at(&self, place: u32) -> u64 {
         u64::from(place) * self.record as u64
     }
@@ -230,6 +252,11 @@ mod tests {
         let places: Vec<u32> = (0..50_001).step_by(3).chain([7, 50_000, 6, 6, 8]).collect();
         let expected: Vec<u64> = places.iter().map(|&p| if p == 7 { 70 } else { p.into() }).collect();
         assert_eq!(scratch.read_as::<u64>(&places).unwrap(), expected);
+        scratch.put(50_001, bytemuck::bytes_of(&50_001u64)).unwrap();
+        for place in [7, 8, 12_499, 50_000, 50_001] {
+            assert_eq!(scratch.get::<u64>(place).unwrap(), if place == 7 { 70 } else { place.into() });
+        }
+        scratch.flush().unwrap();
         let changed = [3, 9, 12_499, 12_500, 12_501, 49_998];
         scratch.update(&changed, |record| record[0] ^= 1).unwrap();
         let changed = changed.map(|p| u64::from(p) ^ 1);

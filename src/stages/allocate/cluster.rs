@@ -5,7 +5,7 @@ use ndarray::ArrayView2;
 use rayon::prelude::*;
 
 use super::kmeans::{KMeansSettings, kmeans};
-use super::{AllocateError, Allocation, Coding, Shape, uniform, windows};
+use super::{AllocateError, Allocation, Coding, Shape, windows};
 use crate::codec::{BrickRange, Codec, SequenceRange, Texels, decode, encode};
 use crate::settings::{Clustering, RangeMode};
 use crate::stages::dedup::{SequenceTree, carried};
@@ -24,7 +24,7 @@ pub fn clustered(
     mode: RangeMode,
     clustering: &Clustering,
 ) -> Result<Allocation, AllocateError> {
-    let mut allocation = uniform(tree, encodings, codec);
+    let mut allocation = Allocation::new(encodings);
     let sequence = allocation.sequence;
     let (mut ids, mut points) = (Vec::new(), Vec::new());
     for window in windows(tree.pool.len(), BRICKS_IN_FLIGHT) {
@@ -72,17 +72,21 @@ pub fn clustered(
         .map(|(values, texels)| if codec.is_normalised() { texels.range } else { fit(&sequence, values) })
         .collect();
 
+    let mut members = ids.iter().zip(&found.members).peekable();
+    for id in 0..tree.pool.len() {
+        match members.next_if(|(member, _)| **member == id) {
+            Some((_, &shape)) => allocation.push(Coding::Shared(shape), Some(ranges[shape as usize])),
+            None => allocation.push(Coding::Own(codec), None),
+        }
+    }
     let rules = tree.brick_rules();
-    for (ids, members) in
+    for (ids, shapes) in
         ids.chunks(BRICKS_IN_FLIGHT as usize).zip(found.members.chunks(BRICKS_IN_FLIGHT as usize))
     {
         let bricks = tree.pool.read(ids)?;
-        for ((&id, &member), brick) in ids.iter().zip(members).zip(&bricks) {
-            let brick_rule = rules[id as usize];
-            allocation.norms[id as usize] =
-                brick.error_norm(&decoded[member as usize], &carried(&brick.active, brick_rule));
-            allocation.codings[id as usize] = Coding::Shared(member);
-            allocation.borrowed.insert(id, ranges[member as usize]);
+        for ((&id, &shape), brick) in ids.iter().zip(shapes).zip(&bricks) {
+            let carried = carried(&brick.active, rules[id as usize]);
+            allocation.norms.put(id, &[brick.error_norm(&decoded[shape as usize], &carried)])?;
         }
     }
     Ok(allocation)

@@ -12,7 +12,6 @@ mod search;
 mod share;
 mod size;
 
-use std::collections::HashMap;
 use std::io;
 
 use half::f16;
@@ -20,7 +19,7 @@ use half::f16;
 use super::dedup::SequenceTree;
 use super::encodings::Encodings;
 use crate::codec::{BrickRange, Codec, OutOfRange, SequenceRange};
-use crate::volume::ValueRange;
+use crate::volume::{SCRATCH_HEAD, Scratch, Sparse, ValueRange};
 
 pub use adaptive::{AdaptiveGrid, Target, adaptive};
 pub use cluster::clustered;
@@ -29,15 +28,16 @@ pub use cluster::clustered;
 pub struct Allocation {
     /// The range that brick ranges are fractions of.
     pub sequence: SequenceRange,
-    /// How each brick of the pool is coded.
-    pub codings: Vec<Coding>,
-    /// Texels that several bricks share.
+    /// How each brick of the pool is coded, as far as a byte says it.
+    kinds: Vec<Kind>,
+    /// What else there is to say of those of which it does not say all: a value's bits, a lender, a shape.
+    words: Sparse<u32>,
+    /// Texels of no brick's own that several bricks share.
     pub shapes: Vec<Shape>,
     /// Under which range a brick reads texels that were made for another.
-    pub borrowed: HashMap<u32, BrickRange>,
-    /// The root of the squared error of each brick over the voxels that its texels give, as far as it is
-    /// known before texels are made: 0 where [`super::quantise`] will measure it.
-    pub norms: Vec<f64>,
+    borrowed: Sparse<BrickRange>,
+    /// The root of the squared error of each brick over the voxels that its texels give.
+    pub norms: Norms,
     /// The squared error of each frame's empty bricks.
     pub empty_squares: Vec<f64>,
     /// What codecs make of them.
@@ -53,8 +53,27 @@ pub enum Coding {
     Constant(f32),
     /// Texels of its own.
     Own(Codec),
+    /// The texels of this brick, which are its own.
+    Borrowed(u32),
     /// The texels of this place of [`Allocation::shapes`].
     Shared(u32),
+}
+
+/// A [`Coding`] in a byte.
+#[derive(Clone, Copy)]
+enum Kind {
+    Empty,
+    Constant,
+    Own(Codec),
+    Borrowed,
+    Shared,
+}
+
+/// Errors of bricks, 8 bytes each, of which a sequence has too many to keep in memory.
+pub struct Norms {
+    norms: Scratch,
+    /// Whether there is one for each brick before its texels are made. Else quantising adds those that lack.
+    pub are_known: bool,
 }
 
 /// Texels that several bricks share, each with its own range.
@@ -78,24 +97,94 @@ pub enum AllocateError {
     OutOfRange(#[from] OutOfRange),
 }
 
+impl Norms {
+    /// None yet.
+    fn new() -> Self {
+        Self { norms: Scratch::new(size_of::<f64>(), SCRATCH_HEAD), are_known: false }
+    }
+
+    /// Notes those of bricks, one after another.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be written.
+    pub fn put(&mut self, first: u32, norms: &[f64]) -> io::Result<()> {
+        self.norms.put(first, bytemuck::cast_slice(norms))
+    }
+
+    /// Sees to it that what was noted can be read.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be written.
+    pub fn flush(&mut self) -> io::Result<()> {
+        self.norms.flush()
+    }
+
+    /// Those of some bricks.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be read back.
+    pub fn read(&self, ids: &[u32]) -> io::Result<Vec<f64>> {
+        self.norms.read_as(ids)
+    }
+}
+
 impl Allocation {
-    fn new(encodings: Encodings, codings: Vec<Coding>, norms: Vec<f64>) -> Self {
+    fn new(encodings: Encodings) -> Self {
         Self {
             sequence: encodings.sequence,
-            codings,
+            kinds: Vec::new(),
+            words: Sparse::default(),
             shapes: Vec::new(),
-            borrowed: HashMap::new(),
-            norms,
+            borrowed: Sparse::default(),
+            norms: Norms::new(),
             empty_squares: Vec::new(),
             encodings,
         }
     }
 
+    /// Adds the next brick. One that reads texels of another has a range for them.
+    fn push(&mut self, coding: Coding, borrowed: Option<BrickRange>) {
+        let id = self.kinds.len() as u32;
+        let (kind, word) = match coding {
+            Coding::Empty => (Kind::Empty, None),
+            Coding::Constant(value) => (Kind::Constant, Some(value.to_bits())),
+            Coding::Own(codec) => (Kind::Own(codec), None),
+            Coding::Borrowed(lender) => (Kind::Borrowed, Some(lender)),
+            Coding::Shared(shape) => (Kind::Shared, Some(shape)),
+        };
+        self.kinds.push(kind);
+        word.into_iter().for_each(|word| self.words.push(id, word));
+        borrowed.into_iter().for_each(|range| self.borrowed.push(id, range));
+    }
+
+    /// How many bricks there are.
+    pub fn len(&self) -> u32 {
+        self.kinds.len() as u32
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.kinds.is_empty()
+    }
+
+    /// How a brick is coded.
+    pub fn coding(&self, brick: u32) -> Coding {
+        let word = || self.words.get(brick).expect("what a byte does not say is said beside it");
+        match self.kinds[brick as usize] {
+            Kind::Empty => Coding::Empty,
+            Kind::Constant => Coding::Constant(f32::from_bits(word())),
+            Kind::Own(codec) => Coding::Own(codec),
+            Kind::Borrowed => Coding::Borrowed(word()),
+            Kind::Shared => Coding::Shared(word()),
+        }
+    }
+
     /// The codec of a brick.
     pub fn codec(&self, brick: u32) -> Codec {
-        match self.codings[brick as usize] {
+        match self.coding(brick) {
             Coding::Empty | Coding::Constant(_) => Codec::Constant,
             Coding::Own(codec) => codec,
+            Coding::Borrowed(lender) => self.codec(lender),
             Coding::Shared(shape) => self.shapes[shape as usize].codec,
         }
     }
@@ -103,17 +192,14 @@ impl Allocation {
     /// The range of a brick. Raw texels need none to be decoded: theirs is the tight one, for the majorant in it.
     pub fn range(&self, tree: &SequenceTree, brick: u32) -> BrickRange {
         let ValueRange { min, max } = tree.brick_ranges[brick];
-        match self.codings[brick as usize] {
+        match self.coding(brick) {
             Coding::Own(Codec::F32) => self.sequence.fit(min, max),
             // What bounds a voxel is what its texel decodes to.
             Coding::Own(Codec::F16) => {
                 let [min, max] = [min, max].map(|v| f16::from_f32(v).to_f32());
                 self.sequence.fit(min, max)
             }
-            _ => match self.borrowed.get(&brick) {
-                Some(range) => *range,
-                None => self.encodings.range(tree, brick),
-            },
+            _ => self.borrowed.get(brick).unwrap_or_else(|| self.encodings.range(tree, brick)),
         }
     }
 }
@@ -125,6 +211,7 @@ fn windows(bricks: u32, size: u32) -> impl Iterator<Item = Vec<u32>> {
 
 /// Gives every brick of `tree` one codec.
 pub fn uniform(tree: &SequenceTree, encodings: Encodings, codec: Codec) -> Allocation {
-    let bricks = tree.pool.len() as usize;
-    Allocation::new(encodings, vec![Coding::Own(codec); bricks], vec![0.0; bricks])
+    let mut allocation = Allocation::new(encodings);
+    (0..tree.pool.len()).for_each(|_| allocation.push(Coding::Own(codec), None));
+    allocation
 }

@@ -13,9 +13,9 @@ use super::adaptive::AdaptiveGrid;
 use super::choices::{BLOCK, Choices, Table, Weighed, costs};
 use super::rung::Rung;
 use super::share::{Loan, loans};
-use super::{Allocation, Coding, Shape, windows};
+use super::{Allocation, Coding, windows};
 use crate::stages::dedup::{FrameTree, Payload, SequenceTree};
-use crate::stages::encodings::{Cost, Encodings, KeptCodec, Kind, Tried};
+use crate::stages::encodings::{Cost, Encodings, KeptCodec, Kind};
 use crate::trace;
 use crate::volume::ValueRange;
 
@@ -389,44 +389,33 @@ impl<'a> GridSearch<'a> {
     pub(super) fn finish(self, picks: &[Rung]) -> io::Result<Allocation> {
         let Self { tree, encodings, bc7_is_tried, table, .. } = self;
         let loans = table.into_loans();
-        let (mut norms, mut codings) = (Vec::with_capacity(picks.len()), Vec::with_capacity(picks.len()));
+        let mut allocation = Allocation::new(encodings);
         for ids in windows(picks.len() as u32, BLOCK) {
-            for (&id, (costs, value)) in ids.iter().zip(costs(&encodings, &ids, &bc7_is_tried)?) {
+            let mut norms = Vec::with_capacity(ids.len());
+            for (&id, (costs, value)) in ids.iter().zip(costs(&allocation.encodings, &ids, &bc7_is_tried)?) {
                 let rung = picks[id as usize];
-                norms.push(
-                    loans
-                        .get(&id)
-                        .filter(|_| rung == Rung::Borrowed)
-                        .map_or(costs[rung as usize].norm, |loan| loan.norm),
-                );
-                codings.push(match rung {
-                    Rung::Empty | Rung::Borrowed => Coding::Empty,
-                    Rung::Constant => Coding::Constant(value),
-                    rung => Coding::Own(rung.codec()),
-                });
+                let (coding, range, norm) = match rung {
+                    Rung::Borrowed => {
+                        let loan = loans[&id];
+                        (Coding::Borrowed(loan.lender), Some(loan.range), loan.norm)
+                    }
+                    Rung::Empty => (Coding::Empty, None, costs[rung as usize].norm),
+                    Rung::Constant => (Coding::Constant(value), None, costs[rung as usize].norm),
+                    rung => (Coding::Own(rung.codec()), None, costs[rung as usize].norm),
+                };
+                allocation.push(coding, range);
+                norms.push(norm);
             }
+            allocation.norms.put(ids[0], &norms)?;
         }
-        let mut allocation = Allocation::new(encodings, codings, norms);
-        for brick in (0..picks.len()).filter(|&brick| picks[brick] == Rung::Borrowed) {
-            let loan = loans[&(brick as u32)];
-            allocation.borrowed.insert(brick as u32, loan.range);
-            let lender = loan.lender as usize;
-            allocation.codings[brick] = match allocation.codings[lender] {
-                Coding::Own(codec) => {
-                    let kept = KeptCodec::of(codec).expect("raw texels are not lent");
-                    let Tried { bytes, axes, .. } = allocation.encodings.texels(&[loan.lender], kept)?;
-                    allocation.shapes.push(Shape { codec, bytes, axis: axes[0] });
-                    allocation.codings[lender] = Coding::Shared(allocation.shapes.len() as u32 - 1);
-                    allocation.codings[lender]
-                }
-                shared => shared,
-            };
-        }
+        allocation.norms.are_known = true;
+        allocation.norms.flush()?;
         let is_empty = |id: u32| picks[id as usize] == Rung::Empty;
-        let square = |id: u32| allocation.norms[id as usize].powi(2);
-        let frames = tree.frames.iter();
-        allocation.empty_squares =
-            frames.map(|f| tree.frame_bricks(f).filter(|&id| is_empty(id)).map(square).sum()).collect();
+        for frame in &tree.frames {
+            let empty: Vec<u32> = tree.frame_bricks(frame).filter(|&id| is_empty(id)).collect();
+            let squares = allocation.norms.read(&empty)?.into_iter().map(|norm| norm.powi(2));
+            allocation.empty_squares.push(squares.sum());
+        }
         tree.prune(is_empty);
         Ok(allocation)
     }

@@ -15,7 +15,7 @@ use rayon::prelude::*;
 use crate::error::Error;
 use crate::volume::{
     Brick, BrickPool, CellContent, Child, Constant, Coord, FrameStats, InactiveRule, Interner, List, Mask512,
-    ValueRange, bits,
+    Sparse, ValueRange, bits,
 };
 
 pub use outline::{BrickOutline, MaskPolicy, Outline, Values, carried};
@@ -42,7 +42,8 @@ pub struct SequenceTree {
     pub own_bricks: Vec<Range<u32>>,
     /// Gives the voxels of a frame that was added without.
     fetch: Option<Box<Fetch>>,
-    record_of_brick: List<u32>,
+    /// Of bricks that are no entries by themselves.
+    record_of_brick: Sparse<u32>,
     record_of_constant: HashMap<(u32, Option<u32>, InactiveRule), u32>,
 }
 
@@ -180,7 +181,7 @@ impl SequenceTree {
             brick_ranges: List::default(),
             own_bricks: Vec::new(),
             fetch,
-            record_of_brick: List::default(),
+            record_of_brick: Sparse::default(),
             record_of_constant: HashMap::new(),
         }
     }
@@ -190,7 +191,7 @@ impl SequenceTree {
     /// # Errors
     /// When the scratch file cannot be written.
     pub fn seal(&mut self) -> io::Result<()> {
-        self.record_of_brick = List::default();
+        self.record_of_brick = Sparse::default();
         self.record_of_constant = HashMap::new();
         self.nodes.seal();
         self.runs.seal();
@@ -322,18 +323,16 @@ impl SequenceTree {
         };
         let (id, is_new) = self.pool.insert(&digest, active, keeps_mask, place)?;
         if !is_new {
-            return Ok(self.record_of_brick[id]);
+            return Ok(self.record_of_brick.get(id).unwrap_or(id | PLAIN_BRICK));
         }
-        let mask = self.mask(outline);
-        let record = match (mask, rule) {
-            (None, InactiveRule::Texel) => id | PLAIN_BRICK,
-            _ => {
-                self.records.push(Record::new(mask, rule, Payload::Brick(id)));
-                self.records.len() as u32 - 1
-            }
-        };
-        self.record_of_brick.push(record);
         self.brick_ranges.push(range);
+        let mask = self.mask(outline);
+        if (mask, rule) == (None, InactiveRule::Texel) {
+            return Ok(id | PLAIN_BRICK);
+        }
+        let record = self.records.len() as u32;
+        self.records.push(Record::new(mask, rule, Payload::Brick(id)));
+        self.record_of_brick.push(id, record);
         Ok(record)
     }
 
@@ -393,6 +392,8 @@ impl SequenceTree {
                 CellRef::Node(node) => moved[*node as usize].inspect(|to| *node = *to).is_some(),
             });
         }
+        self.nodes.seal();
+        self.runs.seal();
     }
 
     /// The range of everything that is active or carried by a texel; `None` for an empty sequence.

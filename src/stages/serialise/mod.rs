@@ -7,9 +7,9 @@ use std::io;
 use std::path::Path;
 
 use super::allocate::Allocation;
-use super::dedup::SequenceTree;
+use super::dedup::{FrameTree, SequenceTree};
 use super::quantise::{GridBricks, Outcome, QuantiseError, quantise};
-use super::relayout::{self, Layout, PlannedAtlas};
+use super::relayout::{self, Layout};
 use crate::codec::Codec;
 use crate::pack::layout::{AtlasRecord, CHUNK_BYTES, FrameRecord, GridRecord, encoding, kind};
 use crate::pack::tree::L3Record;
@@ -81,7 +81,7 @@ pub fn serialise(
     mut progress: impl FnMut(u64),
 ) -> Result<FinishedPack, SerialiseError> {
     let layout = relayout::place(&grids.iter().map(GridInput::allocation).collect::<Vec<_>>());
-    if layout.atlases.iter().any(|a| a.atlas.bricks >= L3Record::MAX_SLOTS) {
+    if layout.atlases.iter().any(|a| a.bricks >= L3Record::MAX_SLOTS) {
         return Err(too_large(
             &grids[0].name,
             "more distinct bricks of one codec than the 2^27 that a pack holds: use fewer frames".to_owned(),
@@ -94,7 +94,7 @@ pub fn serialise(
     let names: String = grids.iter().map(|g| g.name.as_str()).collect();
     let frame_count: usize = grids.iter().map(|g| g.frames.len()).sum();
     let provenance = provenance.to_json()?;
-    let atlases: Vec<AtlasRecord> = layout.atlases.iter().map(|a| atlas_record(&a.atlas)).collect();
+    let atlases: Vec<AtlasRecord> = layout.atlases.iter().map(atlas_record).collect();
 
     let encoding = |kind, codec| encoding::of(kind, codec, zstd_level.is_some());
     let spec = |kind, raw_bytes: usize| SectionSpec {
@@ -109,7 +109,7 @@ pub fn serialise(
     let mut specs: Vec<SectionSpec> = layout
         .atlases
         .iter()
-        .map(|PlannedAtlas { atlas, .. }| SectionSpec {
+        .map(|atlas| SectionSpec {
             kind: kind::TEXELS,
             codec: atlas.codec as u32,
             encoding: encoding(kind::TEXELS, atlas.codec as u32),
@@ -129,23 +129,22 @@ pub fn serialise(
     ]);
 
     let mut writer = PackWriter::create(path, specs)?;
-    let mut outcomes: Vec<Outcome> =
-        grids.iter_mut().filter_map(|g| g.allocation.as_mut()).map(Outcome::before).collect();
+    let mut outcomes: Vec<Outcome> = grids.iter().map(GridInput::allocation).map(Outcome::before).collect();
     let mut sources: Vec<GridBricks> = grids
         .iter_mut()
         .filter_map(|g| Some(GridBricks { tree: &mut g.tree, allocation: g.allocation.as_mut()? }))
         .collect();
     let compressed =
         |atlas: &Atlas, slab| compress_chunk(slab, encoding(kind::TEXELS, atlas.codec as u32), level);
-    quantise(&layout.atlases, &mut sources, &mut outcomes, compressed, |atlas, slab, chunk| {
+    quantise(&layout, &mut sources, &mut outcomes, compressed, |atlas, slab, chunk| {
         if slab == 0 {
             writer.begin()?;
         }
         progress(atlas.slab_bricks().into());
         writer.chunk(&chunk)
     })?;
-    set_errors(&mut frames, grids, &outcomes);
-    writer.section(bytemuck::cast_slice(&grid_records(grids, &outcomes)), level)?;
+    set_errors(&mut frames, grids)?;
+    writer.section(bytemuck::cast_slice(&grid_records(grids)?), level)?;
     writer.section(names.as_bytes(), level)?;
     writer.section(bytemuck::cast_slice(&atlases), level)?;
     writer.section(bytemuck::cast_slice(&lists), level)?;
@@ -170,7 +169,7 @@ pub fn tree_bytes(grids: &[GridInput]) -> Result<u64, SerialiseError> {
 /// [`SerialiseError::TooLarge`].
 pub fn gpu_bytes(grids: &[GridInput]) -> Result<u64, SerialiseError> {
     let layout = relayout::place(&grids.iter().map(GridInput::allocation).collect::<Vec<_>>());
-    Ok(tree_bytes(grids)? + layout.atlases.iter().map(|a| a.atlas.bytes()).sum::<u64>())
+    Ok(tree_bytes(grids)? + layout.atlases.iter().map(Atlas::bytes).sum::<u64>())
 }
 
 fn too_large(grid: &str, what: String) -> SerialiseError {
@@ -182,29 +181,26 @@ fn atlas_record(atlas: &Atlas) -> AtlasRecord {
     AtlasRecord { codec: codec as u32, bricks, columns, rows, slabs, page_slabs }
 }
 
-fn grid_records(grids: &[GridInput], outcomes: &[Outcome]) -> Vec<GridRecord> {
+fn grid_records(grids: &[GridInput]) -> io::Result<Vec<GridRecord>> {
     let (mut name_offset, mut first_frame) = (0, 0);
-    grids
-        .iter()
-        .zip(outcomes)
-        .map(|(g, outcome)| {
-            let active = g.tree.active_range();
-            let record = GridRecord {
-                name_offset,
-                name_bytes: g.name.len() as u32,
-                class: g.class as u32,
-                first_frame,
-                frames: g.frames.len() as u32,
-                fps: g.fps,
-                active_min: active.map_or(0.0, |r| r.min),
-                active_max: active.map_or(0.0, |r| r.max),
-                codec_norms: codec_norms(g, outcome),
-            };
-            name_offset += record.name_bytes;
-            first_frame += record.frames;
-            record
-        })
-        .collect()
+    let record = |g: &GridInput| {
+        let active = g.tree.active_range();
+        let record = GridRecord {
+            name_offset,
+            name_bytes: g.name.len() as u32,
+            class: g.class as u32,
+            first_frame,
+            frames: g.frames.len() as u32,
+            fps: g.fps,
+            active_min: active.map_or(0.0, |r| r.min),
+            active_max: active.map_or(0.0, |r| r.max),
+            codec_norms: codec_norms(g)?,
+        };
+        name_offset += record.name_bytes;
+        first_frame += record.frames;
+        Ok(record)
+    };
+    grids.iter().map(record).collect()
 }
 
 /// For each grid and frame the chunks that its bricks lie in, ascending: the texel sections are the first of the
@@ -213,47 +209,54 @@ fn frame_slabs(grids: &[GridInput], layout: &Layout) -> Vec<Vec<Vec<u32>>> {
     let mut first_chunk = [0; Codec::WITH_TEXELS.len() + 1];
     let mut slab_bricks = [1; Codec::WITH_TEXELS.len() + 1];
     let mut chunks = 0;
-    for PlannedAtlas { atlas, .. } in &layout.atlases {
+    for atlas in &layout.atlases {
         first_chunk[atlas.codec as usize] = chunks;
         slab_bricks[atlas.codec as usize] = atlas.slab_bricks();
         chunks += atlas.slabs;
     }
-    let of_grid = |(grid, slots): (&GridInput, &Vec<u32>)| {
+    let of_grid = |(g, grid): (usize, &GridInput)| {
         let chunk = |id: u32| {
             let codec = grid.allocation().codec(id);
             let tag = codec as usize;
-            (codec != Codec::Constant).then(|| first_chunk[tag] + slots[id as usize] / slab_bricks[tag])
+            (codec != Codec::Constant).then(|| first_chunk[tag] + layout.slot(g, id) / slab_bricks[tag])
         };
         let of_frame = |frame| grid.tree.frame_bricks(frame).filter_map(chunk).collect::<BTreeSet<u32>>();
         grid.tree.frames.iter().map(|frame| of_frame(frame).into_iter().collect()).collect()
     };
-    grids.iter().zip(&layout.slots).map(of_grid).collect()
+    grids.iter().enumerate().map(of_grid).collect()
 }
 
 /// What each codec cost a grid: the root of the squared error of its bricks over all frames, by tag.
-fn codec_norms(grid: &GridInput, outcome: &Outcome) -> [f32; Codec::WITH_TEXELS.len() + 1] {
+fn codec_norms(grid: &GridInput) -> io::Result<[f32; Codec::WITH_TEXELS.len() + 1]> {
     let mut squares = [0.0; Codec::WITH_TEXELS.len() + 1];
     for frame in &grid.tree.frames {
-        for id in grid.tree.frame_bricks(frame) {
-            squares[grid.allocation().codec(id) as usize] += outcome.norms[id as usize].powi(2);
+        for (id, square) in squares_of(grid, frame)? {
+            squares[grid.allocation().codec(id) as usize] += square;
         }
     }
     squares[Codec::Constant as usize] += grid.allocation().empty_squares.iter().sum::<f64>();
-    squares.map(|s: f64| (s.sqrt() as f32).min(f32::MAX))
+    Ok(squares.map(|s: f64| (s.sqrt() as f32).min(f32::MAX)))
+}
+
+/// The squared errors of a frame's bricks.
+fn squares_of(grid: &GridInput, frame: &FrameTree) -> io::Result<impl Iterator<Item = (u32, f64)>> {
+    let ids: Vec<u32> = grid.tree.frame_bricks(frame).collect();
+    let norms = grid.allocation().norms.read(&ids)?;
+    Ok(ids.into_iter().zip(norms.into_iter().map(|norm| norm.powi(2))))
 }
 
 /// Fills in what encoding cost each frame.
-fn set_errors(frames: &mut [FrameRecord], grids: &[GridInput], outcomes: &[Outcome]) {
+fn set_errors(frames: &mut [FrameRecord], grids: &[GridInput]) -> io::Result<()> {
     let mut frames = frames.iter_mut();
-    for (grid, outcome) in grids.iter().zip(outcomes) {
+    for grid in grids {
         let mut empty = grid.allocation().empty_squares.iter();
         for (tree, frame) in grid.tree.frames.iter().zip(&mut frames) {
-            let square = |id: u32| outcome.norms[id as usize].powi(2);
-            let squares: f64 = grid.tree.frame_bricks(tree).map(square).sum();
+            let squares: f64 = squares_of(grid, tree)?.map(|(_, square)| square).sum();
             let squares = squares + empty.next().copied().unwrap_or(0.0);
             frame.error_norm = squares.sqrt();
         }
     }
+    Ok(())
 }
 
 fn frame_tables(grids: &[GridInput], slabs: &[Vec<Vec<u32>>]) -> (Vec<FrameRecord>, Vec<u32>) {

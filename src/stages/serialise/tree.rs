@@ -4,13 +4,14 @@ use std::collections::BTreeMap;
 
 use super::{GridInput, SerialiseError, too_large};
 use crate::codec::Codec;
+use crate::pack::Atlas;
 use crate::pack::tree::{
     self, GRID_WORDS, HEADER_WORDS, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS,
 };
 use crate::stages::allocate::Coding;
 use crate::stages::dedup::{CellRef, FrameTree, Payload, SequenceTree};
 use crate::stages::quantise::Outcome;
-use crate::stages::relayout::{Layout, PlannedAtlas};
+use crate::stages::relayout::Layout;
 use crate::volume::{CELL_DIM, Constant, Coord, Interner, ROOT_DIM};
 
 /// L1 nodes that all frames of a grid may have room for: 64 MB of links. A box of 40 of them an axis is
@@ -101,7 +102,7 @@ pub(super) struct TreeWords {
 
 impl TreeWords {
     /// Plans them for texels in these atlases.
-    pub fn new(grids: &[GridInput], boxes: &[CellBox], atlases: &[PlannedAtlas]) -> Self {
+    pub fn new(grids: &[GridInput], boxes: &[CellBox], atlases: &[Atlas]) -> Self {
         let mut constants = Interner::<u32>::default();
         let grids_at = HEADER_WORDS;
         let roots_at = grids_at + grids.len() * GRID_WORDS;
@@ -146,7 +147,7 @@ impl TreeWords {
             ] {
                 head[place] = value as u32;
             }
-            for PlannedAtlas { atlas, .. } in atlases {
+            for atlas in atlases {
                 let at = h::atlas(atlas.codec);
                 head[at..at + 3].copy_from_slice(&[atlas.columns, atlas.rows, atlas.page_slabs]);
             }
@@ -179,12 +180,12 @@ impl TreeWords {
                 words
             })
         });
-        let bricks = layout.slots.iter().zip(outcomes);
-        let records =
-            with_first(grids, mask_len).zip(bricks).flat_map(|((grid, first_mask), (slots, outcome))| {
-                let words = move |&entry| l3_record(grid, entry, slots, outcome, first_mask).to_words();
-                grid.tree.runs.items().iter().flat_map(words)
-            });
+        let each = with_first(grids, mask_len).enumerate().zip(outcomes);
+        let records = each.flat_map(move |((g, (grid, first_mask)), outcome)| {
+            let slot = move |id| layout.slot(g, id);
+            let words = move |&entry| l3_record(grid, entry, slot, outcome, first_mask).to_words();
+            grid.tree.runs.items().iter().flat_map(words)
+        });
         let masks = grids.iter().flat_map(|grid| grid.tree.masks.items()).flat_map(|mask| mask.to_words());
         let head = self.head.iter().copied();
         head.chain(nodes).chain(records).chain(masks).chain(self.constants.iter().copied())
@@ -265,19 +266,24 @@ fn frame_roots(
     roots
 }
 
-fn l3_record(grid: &GridInput, entry: u32, slots: &[u32], outcome: &Outcome, first_mask: u32) -> L3Record {
+fn l3_record(
+    grid: &GridInput,
+    entry: u32,
+    slot: impl Fn(u32) -> u32,
+    outcome: &Outcome,
+    first_mask: u32,
+) -> L3Record {
     let record = grid.tree.record(entry);
     let (codec, axis, slot, word2) = match record.payload() {
         Payload::Constant(value) => (Codec::Constant, 0, 0, value.to_bits()),
         Payload::Brick(id) => {
             let allocation = grid.allocation();
-            let brick = id as usize;
-            match allocation.codings[brick] {
+            match allocation.coding(id) {
                 Coding::Empty => (Codec::Constant, 0, 0, grid.tree.background.to_bits()),
                 Coding::Constant(value) => (Codec::Constant, 0, 0, value.to_bits()),
                 _ => {
                     let range = allocation.range(&grid.tree, id).to_word();
-                    (allocation.codec(id), outcome.axes[brick], slots[brick], range)
+                    (allocation.codec(id), outcome.axis(allocation, id), slot(id), range)
                 }
             }
         }
