@@ -25,13 +25,15 @@ use crate::stages::encodings::{Batch, Cost, Encodings, KeptCodec, Tried};
 use crate::trace;
 use crate::volume::{BRICK_VOXELS, Brick, Mask512};
 
-const STAGE: Stage = Stage { name: "share", version: 1, travels: true };
+const STAGE: Stage = Stage { name: "share", version: 2, travels: true };
 
 /// Bricks to either side that a batch is compared with at least: in short frames those of a few.
 const LEAST_NEAR: usize = 128;
-/// Rows of one product: few enough that a frame of 300 bricks has work for every core to
-/// the end. 16 × 6,144 similarities are 0.4 MB.
-const ROWS: usize = 16;
+/// Borrowers that a thread compares at a time. 32 × 6,144 similarities are 0.8 MB.
+const ROWS: usize = 32;
+/// Borrowers of batches that are compared side by side, so that all cores have work to the end. The lenders of a batch
+/// more to either side are in memory, 2.4 KB each.
+const AT_ONCE: usize = 1024;
 /// Lenders that are compared voxel by voxel.
 const CLOSEST: usize = 3;
 /// Values of a shape as it is first compared: means of 2³ voxels.
@@ -67,6 +69,8 @@ struct Lender {
     mean: f64,
     /// Sum of squared differences from the mean.
     energy: f64,
+    /// Sum of squares.
+    squares: f64,
     /// Its shape as it is first compared.
     coarse: [f32; COARSE],
 }
@@ -101,43 +105,55 @@ pub(super) fn loans(
             }
         };
         let comparisons: Vec<Comparison> = window.iter().map(comparison).collect();
+        let keys = comparisons.par_iter().map(|comparison| comparison.key(encodings, tree));
+        let keys: Vec<Option<Key>> = keys.collect::<io::Result<_>>()?;
         if let Some(cache) = encodings.cache() {
-            let keys = comparisons.iter().map(|comparison| comparison.key(encodings, tree));
-            let keys: Vec<Option<Key>> = keys.collect::<io::Result<_>>()?;
-            cache.prefetch(keys.into_iter().flatten());
+            cache.prefetch(keys.iter().copied().flatten());
         }
-        let known: Vec<(Option<Key>, Option<Offers>)> = comparisons
-            .par_iter()
-            .map(|comparison| comparison.known(encodings, tree))
-            .collect::<io::Result<_>>()?;
+        let known = comparisons.par_iter().zip(&keys).map(|(comparison, key)| comparison.known(encodings, *key));
+        let mut known: Vec<Option<Offers>> = known.collect();
         // Frames whose voxels are not there are read side by side.
-        let unknown = comparisons.iter().zip(&known).filter(|(_, (_, known))| known.is_none());
+        let unknown = comparisons.iter().zip(&known).filter(|(_, known)| known.is_none());
         let unknown: Vec<u32> = unknown.flat_map(|(comparison, _)| &comparison.borrowers).copied().collect();
         tree.fetch(&unknown)?;
-        for (comparison, (key, known)) in comparisons.iter().zip(known) {
+        let mut next = 0;
+        while next < comparisons.len() {
             crate::interrupt::check()?;
-            let offers = match known {
-                Some(offers) => offers,
-                None => {
-                    near.move_to(encodings, tree, &comparison.around, &lenders)?;
-                    let offers = comparison.nearest(encodings, tree, &near)?;
-                    if let Some((cache, key)) = encodings.cache().zip(key) {
+            if known[next].is_none() {
+                let unknown = known[next..].iter().take_while(|known| known.is_none()).count();
+                let group = together(&comparisons[next..next + unknown]);
+                near.move_to(encodings, tree, group, &lenders)?;
+                for (i, offers) in (next..).zip(nearest(encodings, tree, group, &near)?) {
+                    if let Some((cache, key)) = encodings.cache().zip(keys[i]) {
                         cache.put(&key, &offers);
                     }
-                    offers
+                    known[i] = Some(offers);
                 }
-            };
+            }
+            let comparison = &comparisons[next];
             let loan = |offer: Offer| Loan {
                 lender: comparison.lenders[offer.lender as usize].0,
                 range: BrickRange::from_word(offer.range),
                 norm: offer.cost.norm,
                 active_norm: offer.cost.active_norm,
             };
+            let offers = known[next].take().expect("what was not known was made");
             let loans = offers.into_iter().map(|offers| offers.into_iter().map(loan).collect());
             visit(&comparison.borrowers, loans.collect())?;
+            next += 1;
         }
     }
     Ok(())
+}
+
+/// The first of some comparisons that are made side by side.
+fn together(comparisons: &[Comparison]) -> &[Comparison] {
+    let mut borrowers = 0;
+    let fits = |comparison: &&Comparison| {
+        borrowers += comparison.borrowers.len();
+        borrowers <= AT_ONCE
+    };
+    &comparisons[..comparisons.iter().take_while(fits).count().max(1)]
 }
 
 /// The borrowers of a batch, and the lenders that they are compared with.
@@ -150,9 +166,8 @@ struct Comparison {
 }
 
 impl Comparison {
-    /// What stands for the offers in the cache, and those that are there.
-    fn known(&self, encodings: &Encodings, tree: &SequenceTree) -> io::Result<(Option<Key>, Option<Offers>)> {
-        let key = self.key(encodings, tree)?;
+    /// The offers that are in the cache.
+    fn known(&self, encodings: &Encodings, key: Option<Key>) -> Option<Offers> {
         let is_sound = |offers: &Offers| {
             offers.len() == self.borrowers.len()
                 && offers.iter().flatten().all(|offer| {
@@ -160,7 +175,7 @@ impl Comparison {
                     (offer.lender as usize) < self.lenders.len() && extent.is_finite() && extent > f16::ZERO
                 })
         };
-        Ok((key, key.and_then(|key| encodings.cache()?.get(&key)).filter(is_sound)))
+        encodings.cache()?.get(&key?).filter(is_sound)
     }
 
     /// What the offers depend on; `None` where nothing is cached.
@@ -209,22 +224,28 @@ struct Near {
 }
 
 impl Near {
-    /// Decodes the lenders of the batches in `around` that were not there for the batch before, and forgets others.
+    /// Decodes the lenders around some batches that were not there for those before, and forgets others.
     fn move_to(
         &mut self,
         encodings: &Encodings,
         tree: &SequenceTree,
-        around: &Range<usize>,
+        comparisons: &[Comparison],
         lenders: &impl Fn(&Range<u32>) -> Vec<(u32, KeptCodec)>,
     ) -> io::Result<()> {
+        let around = comparisons[0].around.start..comparisons[comparisons.len() - 1].around.end;
         self.batches.retain(|batch, _| around.contains(batch));
-        for batch in around.clone() {
+        for batch in around {
             if let Entry::Vacant(place) = self.batches.entry(batch) {
                 let lenders = lenders(&encodings.batches()[batch].ids);
                 place.insert(decoded(encodings, tree, &lenders)?);
             }
         }
         Ok(())
+    }
+
+    /// The lenders of some of the batches.
+    fn lenders(&self, around: &Range<usize>) -> Vec<&Lender> {
+        self.batches.range(around.clone()).flat_map(|(_, lenders)| lenders).collect()
     }
 }
 
@@ -254,15 +275,30 @@ fn decoded(
         let trust = (1.0 - (norm / extent).powi(2) / energy.max(f64::MIN_POSITIVE)).max(0.0).sqrt();
         let mut shape = [0.0; COARSE];
         coarse(&texels, mean, energy, &mut shape);
-        Lender { texels, mean, energy, coarse: shape.map(|v| v * trust as f32) }
+        let squares = sum(|i| f64::from(texels[i]).powi(2));
+        Lender { texels, mean, energy, squares, coarse: shape.map(|v| v * trust as f32) }
     };
     Ok(lenders.par_iter().map(lender).collect())
 }
 
+/// Sums that run side by side: the order of adding is fixed, and a compiler may use vectors.
+const LANES: usize = 8;
+
+/// The sum of something over the voxels of a brick.
+fn sum(of: impl Fn(usize) -> f64) -> f64 {
+    let mut sums = [0.0; LANES];
+    for at in (0..BRICK_VOXELS).step_by(LANES) {
+        for (lane, sum) in sums.iter_mut().enumerate() {
+            *sum += of(at + lane);
+        }
+    }
+    sums.iter().sum()
+}
+
 /// Mean, and sum of squared differences from it.
 fn moments(values: &[f32; BRICK_VOXELS]) -> (f64, f64) {
-    let mean = values.iter().map(|v| f64::from(*v)).sum::<f64>() / BRICK_VOXELS as f64;
-    (mean, values.iter().map(|v| (f64::from(*v) - mean).powi(2)).sum())
+    let mean = sum(|i| f64::from(values[i])) / BRICK_VOXELS as f64;
+    (mean, sum(|i| (f64::from(values[i]) - mean).powi(2)))
 }
 
 /// A shape's coarse values less their mean, over the root of the energy of all 512.
@@ -277,40 +313,75 @@ fn coarse(values: &[f32; BRICK_VOXELS], mean: f64, energy: f64, out: &mut [f32])
     out.iter_mut().for_each(|v| *v = ((f64::from(*v) - 8.0 * mean) * scale) as f32);
 }
 
-impl Comparison {
-    /// For each borrower the closest of the lenders.
-    fn nearest(&self, encodings: &Encodings, tree: &SequenceTree, near: &Near) -> io::Result<Offers> {
-        let lenders: Vec<&Lender> = near.batches.values().flatten().collect();
-        let mut codebook = Array2::<f32>::zeros((lenders.len(), COARSE));
-        for (lender, mut row) in lenders.iter().zip(codebook.rows_mut()) {
+/// For each comparison, and each of its borrowers, the closest of the lenders.
+fn nearest(
+    encodings: &Encodings,
+    tree: &SequenceTree,
+    comparisons: &[Comparison],
+    near: &Near,
+) -> io::Result<Vec<Offers>> {
+    let codebooks = comparisons.par_iter().map(|comparison| Codebook::new(near.lenders(&comparison.around)));
+    let codebooks: Vec<Codebook> = codebooks.collect();
+    let parts = comparisons.iter().zip(&codebooks).flat_map(|(comparison, codebook)| {
+        comparison.borrowers.chunks(ROWS).map(move |ids| (comparison, codebook, ids))
+    });
+    let parts: Vec<(&Comparison, &Codebook, &[u32])> = parts.collect();
+    let offers = parts.into_par_iter().map(|(comparison, codebook, ids)| {
+        let _span = trace::span("share");
+        codebook.nearest(encodings, ids, &tree.pool.read(ids)?, &comparison.lenders)
+    });
+    let mut offers = offers.collect::<io::Result<Vec<Offers>>>()?.into_iter();
+    let parts_of = |comparison: &Comparison| comparison.borrowers.len().div_ceil(ROWS);
+    Ok(comparisons.iter().map(|c| offers.by_ref().take(parts_of(c)).flatten().collect()).collect())
+}
+
+/// The lenders of a comparison, and their shapes as they are first compared, a row each.
+struct Codebook<'a> {
+    lenders: Vec<&'a Lender>,
+    shapes: Array2<f32>,
+}
+
+impl<'a> Codebook<'a> {
+    fn new(lenders: Vec<&'a Lender>) -> Self {
+        let mut shapes = Array2::<f32>::zeros((lenders.len(), COARSE));
+        for (lender, mut row) in lenders.iter().zip(shapes.rows_mut()) {
             row.as_slice_mut().expect("rows are contiguous").copy_from_slice(&lender.coarse);
         }
-        let codebook = codebook.t();
-        let offers = |ids: &[u32]| -> io::Result<Offers> {
-            let _span = trace::span("share");
-            let bricks = tree.pool.read(ids)?;
-            let mut shapes = Array2::<f32>::zeros((bricks.len(), COARSE));
-            for (brick, mut row) in bricks.iter().zip(shapes.rows_mut()) {
-                let (mean, energy) = moments(&brick.values);
-                coarse(&brick.values, mean, energy, row.as_slice_mut().expect("rows are contiguous"));
-            }
-            // The line through a shape leaves 1 - s² of a brick's energy: the most similar leaves the least.
-            let similar = shapes.dot(&codebook);
-            let each = ids.iter().zip(&bricks).zip(similar.rows());
-            let offers = each.map(|((&id, brick), similar)| {
-                let offer = |j: usize| {
-                    let (range, cost) = borrow(encodings, brick, lenders.get(j)?)?;
-                    Some(Offer { lender: j as u32, range: range.to_word(), cost })
-                };
-                let closest = closest(similar.iter().copied(), |j| self.lenders[j].0 != id);
-                let mut offers: Vec<Offer> = closest.into_iter().filter_map(offer).collect();
-                offers.sort_by(|a, b| a.cost.norm.total_cmp(&b.cost.norm));
-                offers
-            });
-            Ok(offers.collect())
-        };
-        let offers: Vec<Offers> = self.borrowers.par_chunks(ROWS).map(offers).collect::<io::Result<_>>()?;
-        Ok(offers.into_iter().flatten().collect())
+        Self { lenders, shapes }
+    }
+
+    /// For each of some bricks the closest lenders; `places` are those of the lenders.
+    fn nearest(
+        &self,
+        encodings: &Encodings,
+        ids: &[u32],
+        bricks: &[Brick],
+        places: &[(u32, KeptCodec)],
+    ) -> io::Result<Offers> {
+        let mut means = Vec::with_capacity(bricks.len());
+        let mut shapes = Array2::<f32>::zeros((bricks.len(), COARSE));
+        for (brick, mut row) in bricks.iter().zip(shapes.rows_mut()) {
+            let (mean, energy) = moments(&brick.values);
+            coarse(&brick.values, mean, energy, row.as_slice_mut().expect("rows are contiguous"));
+            means.push(mean);
+        }
+        // The line through a shape leaves 1 - s² of a brick's energy: the most similar leaves the least.
+        let similar = shapes.dot(&self.shapes.t());
+        let each = ids.iter().zip(bricks).zip(means).zip(similar.rows());
+        let offers = each.map(|(((&id, brick), mean), similar)| {
+            let measure = encodings.measure(brick, &Mask512::ALL);
+            let offer = |j: usize| {
+                let range = borrow(&encodings.sequence, brick, mean, self.lenders.get(j)?)?;
+                let texels = &self.lenders[j].texels;
+                let decoded = std::array::from_fn(|i| encodings.sequence.decode(range, texels[i]));
+                Some(Offer { lender: j as u32, range: range.to_word(), cost: measure.of(&decoded, None) })
+            };
+            let closest = closest(similar.iter().copied(), |j| places[j].0 != id);
+            let mut offers: Vec<Offer> = closest.into_iter().filter_map(offer).collect();
+            offers.sort_by(|a, b| a.cost.norm.total_cmp(&b.cost.norm));
+            offers
+        });
+        Ok(offers.collect())
     }
 }
 
@@ -327,25 +398,18 @@ fn closest(similar: impl Iterator<Item = f32>, may_lend: impl Fn(usize) -> bool)
     closest.map(|(_, j)| j)
 }
 
-/// The brick as a line through a lender's texels; `None` if it runs the other way.
-fn borrow(encodings: &Encodings, brick: &Brick, lender: &Lender) -> Option<(BrickRange, Cost)> {
-    let sequence = &encodings.sequence;
-    let (mean, _) = moments(&brick.values);
-    let pairs = brick.values.iter().zip(lender.texels.iter());
-    let product: f64 =
-        pairs.clone().map(|(v, t)| (f64::from(*v) - mean) * (f64::from(*t) - lender.mean)).sum();
+/// The range under which a lender's texels come closest to a brick of this mean, as a line through them does; `None` if
+/// it runs the other way.
+fn borrow(sequence: &SequenceRange, brick: &Brick, mean: f64, lender: &Lender) -> Option<BrickRange> {
+    let (values, texels) = (&brick.values, &lender.texels);
+    let product = sum(|i| (f64::from(values[i]) - mean) * (f64::from(texels[i]) - lender.mean));
     let (lo, span) = (f64::from(sequence.lo), f64::from(sequence.span));
     let gain = product / lender.energy;
     let min = ((mean - gain * lender.mean - lo) / span * 65535.0).round().clamp(0.0, 65535.0);
     // The minimum is coarse and may have met an end of the range: the extent makes the best of it.
     let rest = lo + span * min / 65535.0;
-    let texel_squares: f64 = lender.texels.iter().map(|t| f64::from(*t).powi(2)).sum();
-    let dot: f64 = pairs.map(|(v, t)| (f64::from(*v) - rest) * f64::from(*t)).sum();
-    let extent = f16::from_f64(dot / texel_squares / span);
-    if !(extent.is_finite() && extent > f16::ZERO) {
-        return None;
-    }
-    let range = BrickRange { min: min as u16, extent };
-    let decoded = std::array::from_fn(|i| sequence.decode(range, lender.texels[i]));
-    Some((range, encodings.measure(brick, &Mask512::ALL, &decoded)))
+    let dot = sum(|i| (f64::from(values[i]) - rest) * f64::from(texels[i]));
+    let extent = f16::from_f64(dot / lender.squares / span);
+    let is_ahead = extent.is_finite() && extent > f16::ZERO;
+    is_ahead.then_some(BrickRange { min: min as u16, extent })
 }

@@ -7,7 +7,7 @@ use crate::volume::{BRICK_VOXELS, Brick, Mask512};
 const LANES: usize = 8;
 
 /// A brick to which decoded values are compared.
-pub(super) struct Measure<'a> {
+pub struct Measure<'a> {
     brick: &'a Brick,
     carried: &'a Mask512,
     /// 1 for voxels that texels give, and for those of them that are active; else 0.
@@ -19,7 +19,7 @@ pub(super) struct Measure<'a> {
 impl<'a> Measure<'a> {
     /// `carried` are the voxels that texels give; `sign_matters` says of level sets from what distance on a voxel must
     /// not change sides.
-    pub fn new(brick: &'a Brick, carried: &'a Mask512, sign_matters: Option<f64>) -> Self {
+    pub(super) fn new(brick: &'a Brick, carried: &'a Mask512, sign_matters: Option<f64>) -> Self {
         let counts = |mask: &Mask512| std::array::from_fn(|i| f32::from(u8::from(mask.get(i))));
         Self { brick, carried, counts: counts(carried), active: counts(&brick.active), sign_matters }
     }

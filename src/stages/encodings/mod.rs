@@ -22,7 +22,7 @@ use crate::volume::{BRICK_VOXELS, BRICKS_IN_FLIGHT, Brick, InactiveRule, Mask512
 use cached::Batches;
 pub use cached::{Batch, GridCache};
 use kept::{Kept, Note};
-use measure::Measure;
+pub use measure::Measure;
 
 /// What one codec does to one brick.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -222,9 +222,9 @@ impl Encodings {
         Texels::new(brick, carried(&brick.active, rule), (range.min, range.max), self.range(tree, id))
     }
 
-    /// What decoded values cost a brick whose texels give the voxels in `carried`.
-    pub fn measure(&self, brick: &Brick, carried: &Mask512, decoded: &[f32; BRICK_VOXELS]) -> Cost {
-        Measure::new(brick, carried, self.terms.sign_matters).of(decoded, None)
+    /// Measures what decoded values cost a brick whose texels give the voxels in `carried`.
+    pub fn measure<'a>(&self, brick: &'a Brick, carried: &'a Mask512) -> Measure<'a> {
+        Measure::new(brick, carried, self.terms.sign_matters)
     }
 
     fn is_known(&self, id: u32, kind: Kind) -> bool {
@@ -294,7 +294,7 @@ impl Encodings {
             ConstantAim::Squares => measure::mean(brick, &texels.carried),
             ConstantAim::Max => f64::midpoint(range.min.into(), range.max.into()) as f32,
         };
-        let measure = Measure::new(brick, &texels.carried, self.terms.sign_matters);
+        let measure = self.measure(brick, &texels.carried);
         // Values just past the greatest half would round to it, but the codec refuses them.
         let f16 = match brick.values.iter().all(|v| v.abs() <= f16::MAX.to_f32()) {
             true => {
@@ -320,7 +320,7 @@ impl Encodings {
         let cost = |(((brick, texels), bytes), &axis): (((&Brick, &Texels), &[u8]), &u8)| {
             let decoded = decode(codec, bytes, axis, &self.sequence, texels.range);
             let spread = spread(codec, bytes, &self.sequence, texels.range);
-            Measure::new(brick, &texels.carried, self.terms.sign_matters).of(&decoded, Some(&spread))
+            self.measure(brick, &texels.carried).of(&decoded, Some(&spread))
         };
         Tried { costs: each.map(cost).collect(), bytes: encoded.bytes, axes: encoded.axes }
     }
