@@ -30,6 +30,7 @@ use schemars::JsonSchema;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
+pub use artefact::pods;
 pub use key::{Key, Stage};
 pub use maintain::{Damage, Stats};
 pub use stamps::Stamp;

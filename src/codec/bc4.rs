@@ -23,8 +23,7 @@ pub(super) fn encode(sequence: &SequenceRange, batch: &[Texels]) -> Vec<u8> {
     let mut out = Vec::with_capacity(batch.len() * BRICK_VOXELS / TEXELS * BLOCK);
     for brick in batch {
         let codes = sequence.normalise(brick.range, &brick.values).map(|fraction| fraction * 255.0);
-        let weights: [f32; BRICK_VOXELS] =
-            std::array::from_fn(|i| if brick.carried.get(i) { 1.0 } else { 0.0 });
+        let weights = brick.carried.weights();
         let (codes, weights) = (texel_order(&codes), texel_order(&weights));
         for block in 0..BRICK_VOXELS / TEXELS {
             let (z, by, bx) = (block / 4, block / 2 % 2, block % 2);

@@ -185,7 +185,8 @@ pub fn decode(
         Codec::F32 => plain::decode(bytes, f32::from_le_bytes, &mut out),
     }
     if codec.is_normalised() {
-        out.iter_mut().for_each(|v| *v = sequence.decode(range, *v));
+        let value = sequence.decoder(range);
+        out.iter_mut().for_each(|v| *v = value(*v));
     }
     out
 }

@@ -69,7 +69,15 @@ impl SequenceRange {
     /// asks of every reader.
     #[inline]
     pub fn decode(&self, brick: BrickRange, t: f32) -> f32 {
-        self.lo + self.span * (f32::from(brick.min) / 65535.0 + brick.extent.to_f32() * t)
+        self.decoder(brick)(t)
+    }
+
+    /// The same for many texels of a brick.
+    #[inline]
+    pub fn decoder(&self, brick: BrickRange) -> impl Fn(f32) -> f32 + use<> {
+        let Self { lo, span } = *self;
+        let (min, extent) = (f32::from(brick.min) / 65535.0, brick.extent.to_f32());
+        move |t| lo + span * (min + extent * t)
     }
 
     /// The tightest [`BrickRange`] around values from `min` to `max`.

@@ -16,6 +16,17 @@ impl std::fmt::Debug for Mask512 {
     }
 }
 
+/// The weights of eight voxels, for each byte of a mask.
+static WEIGHTS: [[f32; 8]; 256] = {
+    let mut all = [[0.0; 8]; 256];
+    let mut i = 0;
+    while i < 256 * 8 {
+        all[i / 8][i % 8] = (i / 8 >> (i % 8) & 1) as f32;
+        i += 1;
+    }
+    all
+};
+
 impl Mask512 {
     /// Every voxel off.
     pub const NONE: Self = Self([0; 8]);
@@ -54,6 +65,16 @@ impl Mask512 {
     /// The indices that are on, ascending.
     pub fn ones(&self) -> impl Iterator<Item = usize> + '_ {
         bits(&self.0)
+    }
+
+    /// 1 for each voxel that is on and 0 for the others, to multiply with.
+    pub fn weights(&self) -> [f32; 512] {
+        let mut weights = [0.0; 512];
+        let bytes = self.0.iter().flat_map(|word| word.to_le_bytes());
+        for (weights, byte) in weights.as_chunks_mut::<8>().0.iter_mut().zip(bytes) {
+            *weights = WEIGHTS[usize::from(byte)];
+        }
+        weights
     }
 
     /// The mask's 16 words as a pack stores them: bit `n` is bit `n % 32` of word `n / 32`.

@@ -13,12 +13,13 @@ use std::collections::btree_map::Entry;
 use std::io;
 use std::ops::Range;
 
+use bytemuck::{Pod, Zeroable};
 use half::f16;
 use ndarray::Array2;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::cache::{Key, Stage};
+use crate::cache::{Key, Stage, pods};
 use crate::codec::{BrickRange, SequenceRange, decode};
 use crate::stages::dedup::SequenceTree;
 use crate::stages::encodings::{Batch, Cost, Encodings, KeptCodec, Tried};
@@ -53,15 +54,25 @@ pub(super) struct Loan {
 }
 
 /// A [`Loan`] by its lender's place among the lenders that were compared, and its range as a record has it.
-#[derive(Clone, Copy, Serialize, Deserialize)]
+#[derive(Clone, Copy, Pod, Zeroable)]
+#[repr(C)]
 struct Offer {
     lender: u32,
     range: u32,
-    cost: Cost,
+    norm: f64,
+    active_norm: f64,
 }
 
-/// For each borrower of a batch, the closest first.
-type Offers = Vec<Vec<Offer>>;
+/// What was offered to the borrowers of a batch.
+#[derive(Default, Serialize, Deserialize)]
+struct Offers {
+    /// How many to each.
+    #[serde(with = "pods")]
+    counts: Vec<u8>,
+    /// One borrower's after another's, of each the closest first.
+    #[serde(with = "pods")]
+    all: Vec<Offer>,
+}
 
 /// A brick that could lend, with its texels as a GPU reads them, 0 to 1.
 struct Lender {
@@ -130,16 +141,8 @@ pub(super) fn loans(
                     known[i] = Some(offers);
                 }
             }
-            let comparison = &comparisons[next];
-            let loan = |offer: Offer| Loan {
-                lender: comparison.lenders[offer.lender as usize].0,
-                range: BrickRange::from_word(offer.range),
-                norm: offer.cost.norm,
-                active_norm: offer.cost.active_norm,
-            };
             let offers = known[next].take().expect("what was not known was made");
-            let loans = offers.into_iter().map(|offers| offers.into_iter().map(loan).collect());
-            visit(&comparison.borrowers, loans.collect())?;
+            visit(&comparisons[next].borrowers, comparisons[next].loans(offers))?;
             next += 1;
         }
     }
@@ -169,13 +172,26 @@ impl Comparison {
     /// The offers that are in the cache.
     fn known(&self, encodings: &Encodings, key: Option<Key>) -> Option<Offers> {
         let is_sound = |offers: &Offers| {
-            offers.len() == self.borrowers.len()
-                && offers.iter().flatten().all(|offer| {
+            offers.counts.len() == self.borrowers.len()
+                && offers.counts.iter().map(|count| usize::from(*count)).sum::<usize>() == offers.all.len()
+                && offers.all.iter().all(|offer| {
                     let extent = BrickRange::from_word(offer.range).extent;
                     (offer.lender as usize) < self.lenders.len() && extent.is_finite() && extent > f16::ZERO
                 })
         };
         encodings.cache()?.get(&key?).filter(is_sound)
+    }
+
+    /// What is offered to each borrower.
+    fn loans(&self, offers: Offers) -> Vec<Vec<Loan>> {
+        let loan = |offer: Offer| Loan {
+            lender: self.lenders[offer.lender as usize].0,
+            range: BrickRange::from_word(offer.range),
+            norm: offer.norm,
+            active_norm: offer.active_norm,
+        };
+        let mut all = offers.all.into_iter().map(loan);
+        offers.counts.iter().map(|&count| all.by_ref().take(count.into()).collect()).collect()
     }
 
     /// What the offers depend on; `None` where nothing is cached.
@@ -330,9 +346,16 @@ fn nearest(
         let _span = trace::span("share");
         codebook.nearest(encodings, ids, &tree.pool.read(ids)?, &comparison.lenders)
     });
-    let mut offers = offers.collect::<io::Result<Vec<Offers>>>()?.into_iter();
-    let parts_of = |comparison: &Comparison| comparison.borrowers.len().div_ceil(ROWS);
-    Ok(comparisons.iter().map(|c| offers.by_ref().take(parts_of(c)).flatten().collect()).collect())
+    let mut parts = offers.collect::<io::Result<Vec<Offers>>>()?.into_iter();
+    let of = |comparison: &Comparison| {
+        let mut offers = Offers::default();
+        for part in parts.by_ref().take(comparison.borrowers.len().div_ceil(ROWS)) {
+            offers.counts.extend(part.counts);
+            offers.all.extend(part.all);
+        }
+        offers
+    };
+    Ok(comparisons.iter().map(of).collect())
 }
 
 /// The lenders of a comparison, and their shapes as they are first compared, a row each.
@@ -367,21 +390,23 @@ impl<'a> Codebook<'a> {
         }
         // The line through a shape leaves 1 - s² of a brick's energy: the most similar leaves the least.
         let similar = shapes.dot(&self.shapes.t());
-        let each = ids.iter().zip(bricks).zip(means).zip(similar.rows());
-        let offers = each.map(|(((&id, brick), mean), similar)| {
+        let mut all = Offers::default();
+        for (((&id, brick), mean), similar) in ids.iter().zip(bricks).zip(means).zip(similar.rows()) {
             let measure = encodings.measure(brick, &Mask512::ALL);
             let offer = |j: usize| {
                 let range = borrow(&encodings.sequence, brick, mean, self.lenders.get(j)?)?;
-                let texels = &self.lenders[j].texels;
-                let decoded = std::array::from_fn(|i| encodings.sequence.decode(range, texels[i]));
-                Some(Offer { lender: j as u32, range: range.to_word(), cost: measure.of(&decoded, None) })
+                let value = encodings.sequence.decoder(range);
+                let decoded = self.lenders[j].texels.map(value);
+                let Cost { norm, active_norm, .. } = measure.of(&decoded, None);
+                Some(Offer { lender: j as u32, range: range.to_word(), norm, active_norm })
             };
             let closest = closest(similar.iter().copied(), |j| places[j].0 != id);
             let mut offers: Vec<Offer> = closest.into_iter().filter_map(offer).collect();
-            offers.sort_by(|a, b| a.cost.norm.total_cmp(&b.cost.norm));
-            offers
-        });
-        Ok(offers.collect())
+            offers.sort_by(|a, b| a.norm.total_cmp(&b.norm));
+            all.counts.push(offers.len() as u8);
+            all.all.extend(offers);
+        }
+        Ok(all)
     }
 }
 

@@ -218,7 +218,9 @@ impl SequenceTree {
                         node.children[usize::from(place) >> 6] |= 1 << (place & 63);
                         run.push(match child {
                             Child::Constant(constant) => self.constant_region(constant),
-                            Child::Brick(brick) => self.brick(brick, &outline.bricks[brick as usize])?,
+                            Child::Brick(brick) => {
+                                self.brick(brick, &outline.bricks[brick as usize], &outline.minus)?
+                            }
                         });
                     }
                     node.run = self.runs.intern(&run).into();
@@ -311,22 +313,22 @@ impl SequenceTree {
         id
     }
 
-    /// The record of a brick of the frame that is being added.
-    fn brick(&mut self, place: u32, outline: &BrickOutline) -> io::Result<u32> {
-        let &BrickOutline { ref active, keeps_mask, rule, values, .. } = outline;
-        let (range, digest) = match values {
+    /// The record of a brick of the frame that is being added, whose signs are among `minus`.
+    fn brick(&mut self, place: u32, outline: &BrickOutline, minus: &[Mask512]) -> io::Result<u32> {
+        let (rule, keeps_mask) = (outline.rule(), outline.keeps_mask());
+        let (range, digest) = match outline.values() {
             Values::Constant(value) => {
-                let mask = self.mask(outline);
+                let mask = self.mask(outline, minus);
                 return Ok(self.constant_record(value, mask, rule));
             }
             Values::Varied(range, digest) => (range, digest),
         };
-        let (id, is_new) = self.pool.insert(&digest, active, keeps_mask, place)?;
+        let (id, is_new) = self.pool.insert(&digest, &outline.active, keeps_mask, place)?;
         if !is_new {
             return Ok(self.record_of_brick.get(id).unwrap_or(id | PLAIN_BRICK));
         }
         self.brick_ranges.push(range);
-        let mask = self.mask(outline);
+        let mask = self.mask(outline, minus);
         if (mask, rule) == (None, InactiveRule::Texel) {
             return Ok(id | PLAIN_BRICK);
         }
@@ -336,9 +338,9 @@ impl SequenceTree {
         Ok(record)
     }
 
-    fn mask(&mut self, outline: &BrickOutline) -> Option<u32> {
-        outline.keeps_mask.then(|| match outline.minus {
-            Some(minus) => self.masks.intern(&[outline.active, minus]),
+    fn mask(&mut self, outline: &BrickOutline, minus: &[Mask512]) -> Option<u32> {
+        outline.keeps_mask().then(|| match outline.signs() {
+            Some(place) => self.masks.intern(&[outline.active, minus[place]]),
             None => self.masks.intern(&[outline.active]),
         })
     }

@@ -1,12 +1,14 @@
 //! What a flattened frame is without its voxels: all that sharing needs, in a seventh of the source's bytes.
 
+use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use crate::cache::pods;
 use crate::stages::flatten::Flattened;
 use crate::volume::{
-    Brick, BrickPool, CELL_DIM, Cell, CellContent, Child, Constant, Coord, FrameStats, InactiveRule, Mask512,
-    ROOT_DIM, ValueRange,
+    Brick, BrickPool, CELL_DIM, Cell, CellContent, Child, Constant, Coord, FlatFrame, FrameStats, InactiveRule,
+    Mask512, ROOT_DIM, ValueRange,
 };
 
 /// Whether bricks keep their active masks.
@@ -32,28 +34,39 @@ pub struct Outline {
     /// The cells that are not all background, ascending by origin.
     pub cells: Vec<Cell>,
     /// The bricks that the cells name, in the order in which they name them.
+    #[serde(with = "pods")]
     pub bricks: Vec<BrickOutline>,
+    /// For those whose rule is [`InactiveRule::Sign`], in that order, the voxels at minus the background.
+    #[serde(with = "pods")]
+    pub minus: Vec<Mask512>,
     /// The source's counts.
     pub stats: FrameStats,
 }
 
 /// A brick without its voxels: what can be found out about it without knowing the others.
-#[derive(Clone, Serialize, Deserialize)]
+#[derive(Clone, Copy, Pod, Zeroable)]
+#[repr(C)]
 pub struct BrickOutline {
     /// Which voxels of the source are active.
     pub active: Mask512,
-    /// Whether that has to be kept.
-    pub keeps_mask: bool,
-    /// What its inactive voxels are.
-    pub rule: InactiveRule,
-    /// For [`InactiveRule::Sign`], those at minus the background.
-    pub minus: Option<Mask512>,
-    /// What its other voxels are.
-    pub values: Values,
+    /// [`BrickPool::digest`]; nothing where all values are one.
+    digest: [u8; 32],
+    /// The range of the values that its texels have to give.
+    min: f32,
+    max: f32,
+    /// The place of its mask in [`Outline::minus`], if it has one.
+    minus: u32,
+    /// An [`InactiveRule`] in the lowest bits, and those below.
+    flags: u32,
 }
 
+/// Its active mask has to be kept.
+const KEEPS_MASK: u32 = 1 << 2;
+/// All values that its texels have to give are one.
+const IS_CONSTANT: u32 = 1 << 3;
+
 /// The voxels of a brick that its texels have to give.
-#[derive(Clone, Copy, Serialize, Deserialize)]
+#[derive(Clone, Copy)]
 pub enum Values {
     /// All the same, bit by bit.
     Constant(f32),
@@ -64,11 +77,15 @@ pub enum Values {
 impl Outline {
     /// Takes the voxels away from a frame: gives them apart, each brick with whether it keeps its mask.
     pub fn split(flat: Flattened, policy: MaskPolicy) -> (Self, Vec<Brick>) {
-        let Flattened { frame, background } = flat;
-        let mut voxels = frame.bricks;
-        let bricks = voxels.par_iter_mut().map(|b| BrickOutline::new(b, background, policy)).collect();
-        let outline = Self { background, roots: frame.roots, cells: frame.cells, bricks, stats: frame.stats };
-        (outline, voxels)
+        let Flattened { frame: FlatFrame { roots, cells, bricks: mut voxels, stats }, background } = flat;
+        let outlined = voxels.par_iter_mut().map(|b| BrickOutline::new(b, background, policy));
+        let (mut bricks, signs): (Vec<BrickOutline>, Vec<Option<Mask512>>) = outlined.unzip();
+        let mut minus = Vec::new();
+        for (brick, signs) in bricks.iter_mut().zip(signs) {
+            brick.minus = minus.len() as u32;
+            minus.extend(signs);
+        }
+        (Self { background, roots, cells, bricks, minus, stats }, voxels)
     }
 
     /// Whether what it says is of one piece: a frame that was read is, and what comes from elsewhere has to be looked
@@ -90,7 +107,7 @@ impl Outline {
                 in_order && numbered && children.last().is_none_or(|(place, _)| *place < 4096)
             }
         }) && next as usize == self.bricks.len()
-            && self.bricks.iter().all(BrickOutline::is_sound)
+            && self.bricks.iter().all(|brick| brick.is_sound(self.minus.len()))
             && self.cells.is_sorted_by(|a, b| a.origin < b.origin)
             && self.cells.iter().all(|cell| cell.origin.is_aligned(CELL_DIM))
             && self.roots.iter().all(|(origin, _)| origin.is_aligned(ROOT_DIM))
@@ -104,19 +121,42 @@ impl Outline {
 }
 
 impl BrickOutline {
-    fn is_sound(&self) -> bool {
-        let in_order = match self.values {
+    /// Whether its active mask has to be kept.
+    pub fn keeps_mask(&self) -> bool {
+        self.flags & KEEPS_MASK != 0
+    }
+
+    /// What its inactive voxels are.
+    pub fn rule(&self) -> InactiveRule {
+        InactiveRule::from_bits(self.flags)
+    }
+
+    /// What its other voxels are.
+    pub fn values(&self) -> Values {
+        match self.flags & IS_CONSTANT {
+            0 => Values::Varied(ValueRange { min: self.min, max: self.max }, self.digest),
+            _ => Values::Constant(self.min),
+        }
+    }
+
+    /// The place of its signs in [`Outline::minus`], if it has some.
+    pub fn signs(&self) -> Option<usize> {
+        (self.rule() == InactiveRule::Sign).then_some(self.minus as usize)
+    }
+
+    fn is_sound(&self, minus: usize) -> bool {
+        let in_order = match self.values() {
             Values::Constant(_) => true,
             Values::Varied(range, _) => {
                 range.min.is_finite() && range.max.is_finite() && range.min <= range.max
             }
         };
         in_order
-            && self.minus.is_some() == (self.rule == InactiveRule::Sign)
-            && (self.keeps_mask || self.rule == InactiveRule::Texel)
+            && self.signs().is_none_or(|place| place < minus)
+            && (self.keeps_mask() || self.rule() == InactiveRule::Texel)
     }
 
-    fn new(brick: &mut Brick, background: f32, policy: MaskPolicy) -> Self {
+    fn new(brick: &mut Brick, background: f32, policy: MaskPolicy) -> (Self, Option<Mask512>) {
         let (rule, minus) = brick.inactive_rule(background);
         let drop = match policy {
             MaskPolicy::Keep => false,
@@ -125,9 +165,18 @@ impl BrickOutline {
         };
         brick.keeps_mask = !(drop && rule == InactiveRule::Background);
         let rule = if brick.keeps_mask { rule } else { InactiveRule::Texel };
-        let minus = (rule == InactiveRule::Sign).then_some(minus);
-        let values = values(brick, &carried(&brick.active, rule), background);
-        Self { active: brick.active, keeps_mask: brick.keeps_mask, rule, minus, values }
+        let mut outline = Self { active: brick.active, ..Self::zeroed() };
+        outline.flags = rule as u32 | if brick.keeps_mask { KEEPS_MASK } else { 0 };
+        match values(brick, &carried(&brick.active, rule), background) {
+            Values::Constant(value) => {
+                outline.flags |= IS_CONSTANT;
+                (outline.min, outline.max) = (value, value);
+            }
+            Values::Varied(range, digest) => {
+                (outline.min, outline.max, outline.digest) = (range.min, range.max, digest);
+            }
+        }
+        (outline, (rule == InactiveRule::Sign).then_some(minus))
     }
 }
 

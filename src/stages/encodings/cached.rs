@@ -11,15 +11,15 @@ use std::sync::Arc;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::{Cost, Encodings, KeptCodec, Kind, Made, Plain, Terms, Tried};
-use crate::cache::{Cache, Key, Stage};
+use super::{Encodings, KeptCodec, Kind, Made, Note, Terms};
+use crate::cache::{Cache, Key, Stage, pods};
 use crate::codec::{SequenceRange, encoder_isa};
 use crate::stages::dedup::SequenceTree;
 
 /// Bricks of a batch: with 512 bytes of texels each, an entry of a megabyte.
 pub const BATCH_BRICKS: u32 = 2048;
 
-const STAGE: Stage = Stage { name: "encode", version: 1, travels: false };
+const STAGE: Stage = Stage { name: "encode", version: 2, travels: false };
 const BASE: Stage = Stage { name: "batch", version: 1, travels: false };
 
 /// Where the results of one grid's frames are kept.
@@ -39,11 +39,8 @@ pub struct Batch {
     /// The bricks of the pool that the frame had first and that are in this part of it.
     pub ids: Range<u32>,
     /// Whether the entries of each kind were looked for, and whether they lack something.
-    states: [State; KINDS],
+    states: [State; Kind::ALL.len()],
 }
-
-/// [`Kind::Plain`] and three codecs.
-const KINDS: usize = 4;
 
 #[derive(Clone, Copy, Default)]
 struct State {
@@ -60,40 +57,13 @@ pub(super) struct Batches {
 /// What lies in the cache: bricks by their places in the frame, ascending.
 #[derive(Default, Serialize, Deserialize)]
 struct Entry {
+    #[serde(with = "pods")]
     places: Vec<u32>,
     /// Hashes of their active masks: a brick without a mask of its own stands for bricks of other frames too, and what
     /// is active in any of them counts.
+    #[serde(with = "pods")]
     actives: Vec<u64>,
-    plain: Vec<Plain>,
-    costs: Vec<Cost>,
-    #[serde(with = "serde_bytes")]
-    axes: Vec<u8>,
-    #[serde(with = "serde_bytes")]
-    bytes: Vec<u8>,
-}
-
-impl Kind {
-    fn index(self) -> usize {
-        match self {
-            Self::Plain => 0,
-            Self::Texels(codec) => 1 + codec as usize,
-        }
-    }
-
-    /// Bytes of texels of a brick.
-    fn size(self) -> usize {
-        match self {
-            Self::Plain => 0,
-            Self::Texels(codec) => codec.brick_bytes(),
-        }
-    }
-
-    const ALL: [Self; KINDS] = [
-        Self::Plain,
-        Self::Texels(KeptCodec::Bc7),
-        Self::Texels(KeptCodec::Bc4),
-        Self::Texels(KeptCodec::Unorm8),
-    ];
+    made: Made,
 }
 
 /// What the cache has of a batch.
@@ -101,8 +71,7 @@ struct Found {
     kind: Kind,
     /// Bricks of the pool.
     ids: Vec<u32>,
-    /// Those bricks, and no others.
-    entry: Entry,
+    made: Made,
 }
 
 impl Batch {
@@ -125,11 +94,11 @@ impl Batch {
             }
         }
         if places.len() == all.places.len() {
-            return Ok(Some(Found { kind, ids, entry: all }));
+            return Ok(Some(Found { kind, ids, made: all.made }));
         }
-        let mut entry = Entry::default();
-        places.into_iter().for_each(|i| entry.push_from(&all, i, kind.size()));
-        Ok(Some(Found { kind, ids, entry }))
+        let mut made = Made::default();
+        places.into_iter().for_each(|i| made.push_from(&all.made, i, kind));
+        Ok(Some(Found { kind, ids, made }))
     }
 }
 
@@ -170,33 +139,26 @@ impl Batches {
     }
 }
 
+impl Made {
+    fn push_from(&mut self, other: &Self, i: usize, kind: Kind) {
+        self.notes.extend_from_slice(&other.notes[i * kind.notes()..][..kind.notes()]);
+        self.texels.extend_from_slice(&other.texels[i * kind.texels()..][..kind.texels()]);
+    }
+}
+
 impl Entry {
     fn is_sound(&self, kind: Kind) -> bool {
+        let Made { notes, texels } = &self.made;
         let count = self.places.len();
-        let lengths = [self.actives.len(), self.plain.len(), self.costs.len(), self.axes.len()];
-        let expected = if kind == Kind::Plain { [count, count, 0, 0] } else { [count, 0, count, count] };
-        lengths == expected
-            && self.bytes.len() == count * kind.size()
+        let is_axis = |note: &Note| match kind {
+            Kind::Plain => true,
+            Kind::Texels(KeptCodec::Bc7) => note.word <= 2,
+            Kind::Texels(_) => note.word == 2,
+        };
+        [self.actives.len(), notes.len(), texels.len()]
+            == [count, count * kind.notes(), count * kind.texels()]
             && self.places.is_sorted_by(|a, b| a < b)
-            && self.axes.iter().all(|&axis| axis == 2 || (axis < 2 && kind == Kind::Texels(KeptCodec::Bc7)))
-    }
-
-    fn into_made(self, kind: Kind) -> Made {
-        match kind {
-            Kind::Plain => Made::Plain(self.plain),
-            Kind::Texels(codec) => {
-                Made::Texels(codec, Tried { costs: self.costs, bytes: self.bytes, axes: self.axes })
-            }
-        }
-    }
-
-    fn push_from(&mut self, other: &Self, i: usize, size: usize) {
-        self.places.push(other.places[i]);
-        self.actives.push(other.actives[i]);
-        self.plain.extend(other.plain.get(i));
-        self.costs.extend(other.costs.get(i));
-        self.axes.extend(other.axes.get(i));
-        self.bytes.extend(&other.bytes[i * size..(i + 1) * size]);
+            && notes.iter().all(is_axis)
     }
 
     /// What is in either; of what is in both, this one's.
@@ -208,7 +170,11 @@ impl Entry {
         all.sort_by_key(|(place, ..)| *place);
         all.dedup_by_key(|(place, ..)| *place);
         let mut union = Self::default();
-        all.into_iter().for_each(|(_, entry, i)| union.push_from(entry, i, kind.size()));
+        for (place, entry, i) in all {
+            union.places.push(place);
+            union.actives.push(entry.actives[i]);
+            union.made.push_from(&entry.made, i, kind);
+        }
         union
     }
 }
@@ -244,8 +210,8 @@ impl Encodings {
                 .par_iter()
                 .map(|&(batch, kind)| batches[batch].find(tree, &cache, kind))
                 .collect::<io::Result<_>>()?;
-            for Found { kind, ids, entry } in found.into_iter().flatten() {
-                self.keep(&ids, entry.into_made(kind))?;
+            for Found { kind, ids, made } in found.into_iter().flatten() {
+                self.keep(&ids, kind, &made)?;
             }
         }
         self.flush()?;
@@ -265,7 +231,7 @@ impl Encodings {
                     continue;
                 }
                 let (ids, key) = (batch.ids.clone(), batch.key(kind).expect("what is cached has a key"));
-                let known: Vec<u32> = ids.filter(|&id| self.is_known(id, kind)).collect();
+                let known: Vec<u32> = ids.filter(|&id| self.kept(kind).is_known(id)).collect();
                 let entry = self.entry(tree, &known, kind)?;
                 // Another build may have asked for other bricks of the frame.
                 let others = cache.peek::<Entry>(&key).filter(|entry| entry.is_sound(kind));
@@ -277,18 +243,11 @@ impl Encodings {
     }
 
     fn entry(&self, tree: &SequenceTree, ids: &[u32], kind: Kind) -> io::Result<Entry> {
-        let mut entry = Entry {
+        let kept = self.kept(kind);
+        Ok(Entry {
             places: ids.iter().map(|&id| tree.pool.place(id)).collect(),
             actives: tree.pool.active_hashes(ids)?,
-            ..Entry::default()
-        };
-        match kind {
-            Kind::Plain => entry.plain = self.plain(ids)?,
-            Kind::Texels(codec) => {
-                let Tried { costs, bytes, axes } = self.texels(ids, codec)?;
-                entry = Entry { costs, bytes, axes, ..entry };
-            }
-        }
-        Ok(entry)
+            made: Made { notes: kept.notes(ids)?, texels: kept.texels(ids)? },
+        })
     }
 }

@@ -4,7 +4,7 @@ use std::io;
 
 use bytemuck::{Pod, Zeroable};
 
-use super::{Cost, KeptCodec, Kind};
+use super::{Cost, KeptCodec, Kind, Made};
 use crate::volume::{SCRATCH_HEAD, Scratch};
 
 /// A [`Cost`], and something more of what it is the cost of.
@@ -27,8 +27,8 @@ impl Note {
     }
 }
 
-/// One kind of result for the bricks of a pool, each once: `N` notes a brick, and texels.
-pub(super) struct Kept<const N: usize> {
+/// One kind of result for the bricks of a pool, each once: notes and texels.
+pub(super) struct Kept {
     places: Places,
     notes: Scratch,
     texels: Option<Scratch>,
@@ -91,11 +91,14 @@ impl Places {
     }
 }
 
-impl<const N: usize> Kept<N> {
-    /// Nothing yet of a kind, with that many bytes of texels each.
-    pub fn new(kind: Kind, texels: usize) -> Self {
-        let texels = (texels > 0).then(|| Scratch::new(texels, 0));
-        Self { places: Places::new(kind), notes: Scratch::new(N * size_of::<Note>(), SCRATCH_HEAD), texels }
+impl Kept {
+    /// Nothing yet of a kind.
+    pub fn new(kind: Kind) -> Self {
+        Self {
+            places: Places::new(kind),
+            notes: Scratch::new(kind.notes() * size_of::<Note>(), SCRATCH_HEAD),
+            texels: (kind.texels() > 0).then(|| Scratch::new(kind.texels(), 0)),
+        }
     }
 
     pub fn is_known(&self, id: u32) -> bool {
@@ -103,18 +106,17 @@ impl<const N: usize> Kept<N> {
     }
 
     /// Keeps what was made of some bricks of a pool of `bricks`.
-    pub fn add(&mut self, bricks: usize, ids: &[u32], notes: &[[Note; N]], texels: &[u8]) -> io::Result<()> {
+    pub fn add(&mut self, bricks: usize, ids: &[u32], made: &Made) -> io::Result<()> {
         let places: Vec<u32> = ids.iter().map(|&id| self.places.take(bricks, id)).collect();
-        let (mut notes, mut texels) = (notes, texels);
+        let (mut notes, mut texels) = (bytemuck::cast_slice(&made.notes), &made.texels[..]);
+        let put = |scratch: &mut Scratch, places: &[u32], records: &mut &[u8]| {
+            let (now, later) = records.split_at(places.len() * scratch.record());
+            *records = later;
+            scratch.put(places[0], now)
+        };
         for places in places.chunk_by(|a, b| *b == a + 1) {
-            let (now, later) = notes.split_at(places.len());
-            self.notes.put(places[0], bytemuck::cast_slice(now.as_flattened()))?;
-            notes = later;
-            if let Some(scratch) = &mut self.texels {
-                let (now, later) = texels.split_at(places.len() * scratch.record());
-                scratch.put(places[0], now)?;
-                texels = later;
-            }
+            put(&mut self.notes, places, &mut notes)?;
+            self.texels.as_mut().map_or(Ok(()), |scratch| put(scratch, places, &mut texels))?;
         }
         Ok(())
     }
@@ -129,13 +131,13 @@ impl<const N: usize> Kept<N> {
         ids.iter().map(|&id| self.places.of(id)).collect()
     }
 
-    /// The notes of bricks that are known.
-    pub fn notes(&self, ids: &[u32]) -> io::Result<Vec<[Note; N]>> {
-        let mut notes = Vec::with_capacity(ids.len());
+    /// The notes of bricks that are known, one after another.
+    pub fn notes(&self, ids: &[u32]) -> io::Result<Vec<Note>> {
+        let each = self.notes.record() / size_of::<Note>();
+        let mut notes = vec![Note::zeroed(); ids.len() * each];
+        let mut next = notes.chunks_exact_mut(each);
         self.notes.read(&self.places(ids), |record| {
-            let mut each = [Note::zeroed(); N];
-            bytemuck::cast_slice_mut(&mut each).copy_from_slice(record);
-            notes.push(each);
+            bytemuck::cast_slice_mut(next.next().expect("a record a brick")).copy_from_slice(record);
         })?;
         Ok(notes)
     }

@@ -20,8 +20,7 @@ impl<'a> Measure<'a> {
     /// `carried` are the voxels that texels give; `sign_matters` says of level sets from what distance on a voxel must
     /// not change sides.
     pub(super) fn new(brick: &'a Brick, carried: &'a Mask512, sign_matters: Option<f64>) -> Self {
-        let counts = |mask: &Mask512| std::array::from_fn(|i| f32::from(u8::from(mask.get(i))));
-        Self { brick, carried, counts: counts(carried), active: counts(&brick.active), sign_matters }
+        Self { brick, carried, counts: carried.weights(), active: brick.active.weights(), sign_matters }
     }
 
     /// What `decoded` costs, and what a GPU that is `spread` off at each voxel may read.

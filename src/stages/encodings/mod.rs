@@ -14,6 +14,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::dedup::{SequenceTree, carried};
+use crate::cache::pods;
 use crate::codec::{BATCH, BrickRange, Codec, SequenceRange, Texels, decode, encode, spread};
 use crate::interrupt;
 use crate::settings::RangeMode;
@@ -25,7 +26,7 @@ use kept::{Kept, Note};
 pub use measure::Measure;
 
 /// What one codec does to one brick.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cost {
     /// Root of the squared error over the voxels that texels give; infinite where the codec is out of the
     /// question.
@@ -53,7 +54,7 @@ pub enum ConstantAim {
 }
 
 /// A brick without texels, or with raw ones: what can be said of it without keeping a byte.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Plain {
     /// What it would be as a constant.
     pub value: f32,
@@ -66,7 +67,7 @@ pub struct Plain {
 }
 
 /// What is made of bricks and kept.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub enum Kind {
     /// [`Plain`].
     Plain,
@@ -74,8 +75,41 @@ pub enum Kind {
     Texels(KeptCodec),
 }
 
+impl Kind {
+    const ALL: [Self; 4] = [
+        Self::Plain,
+        Self::Texels(KeptCodec::Bc7),
+        Self::Texels(KeptCodec::Bc4),
+        Self::Texels(KeptCodec::Unorm8),
+    ];
+
+    /// Its place among them.
+    fn index(self) -> usize {
+        match self {
+            Self::Plain => 0,
+            Self::Texels(codec) => 1 + codec as usize,
+        }
+    }
+
+    /// Notes that are kept of a brick.
+    fn notes(self) -> usize {
+        match self {
+            Self::Plain => Plain::NOTES,
+            Self::Texels(_) => 1,
+        }
+    }
+
+    /// Bytes of texels of a brick.
+    fn texels(self) -> usize {
+        match self {
+            Self::Plain => 0,
+            Self::Texels(codec) => codec.codec().layout().brick_bytes(),
+        }
+    }
+}
+
 /// The codecs whose texels are kept. Raw ones take as much to keep as to make.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub enum KeptCodec {
     /// BC7.
     Bc7,
@@ -102,20 +136,17 @@ impl KeptCodec {
             Self::Unorm8 => Codec::Unorm8,
         }
     }
-
-    /// Bytes of a brick's texels.
-    fn brick_bytes(self) -> usize {
-        self.codec().layout().brick_bytes()
-    }
 }
 
 impl Plain {
-    fn to_notes(self) -> [Note; 3] {
+    const NOTES: usize = 3;
+
+    fn to_notes(self) -> [Note; Self::NOTES] {
         let value = self.value.to_bits();
         [Note::new(self.constant, value), Note::new(self.empty, 0), Note::new(self.f16, 0)]
     }
 
-    fn from_notes([constant, empty, f16]: [Note; 3]) -> Self {
+    fn from_notes([constant, empty, f16]: [Note; Self::NOTES]) -> Self {
         let value = f32::from_bits(constant.word);
         Self { value, constant: constant.cost(), empty: empty.cost(), f16: f16.cost() }
     }
@@ -144,8 +175,7 @@ pub struct Encodings {
     pub sequence: SequenceRange,
     terms: Terms,
     rules: Vec<InactiveRule>,
-    plain: Kept<3>,
-    kept: [Kept<1>; KeptCodec::ALL.len()],
+    kept: [Kept; Kind::ALL.len()],
     batches: Batches,
     saved: Instant,
 }
@@ -161,8 +191,7 @@ impl Encodings {
         let batches = Batches::new(tree, cache, &sequence, &terms);
         Some(Self {
             rules: tree.brick_rules(),
-            plain: Kept::new(Kind::Plain, 0),
-            kept: KeptCodec::ALL.map(|codec| Kept::new(Kind::Texels(codec), codec.brick_bytes())),
+            kept: Kind::ALL.map(Kept::new),
             batches,
             saved: Instant::now(),
             sequence,
@@ -175,7 +204,8 @@ impl Encodings {
     /// # Errors
     /// When the scratch file cannot be read back.
     pub fn plain(&self, ids: &[u32]) -> io::Result<Vec<Plain>> {
-        Ok(self.plain.notes(ids)?.into_iter().map(Plain::from_notes).collect())
+        let notes = self.kept(Kind::Plain).notes(ids)?;
+        Ok(notes.as_chunks().0.iter().copied().map(Plain::from_notes).collect())
     }
 
     /// What a codec does to some bricks that it was tried on.
@@ -183,7 +213,7 @@ impl Encodings {
     /// # Errors
     /// When the scratch file cannot be read back.
     pub fn costs(&self, ids: &[u32], codec: KeptCodec) -> io::Result<Vec<Cost>> {
-        Ok(self.kept[codec as usize].notes(ids)?.into_iter().map(|[note]| note.cost()).collect())
+        Ok(self.kept(Kind::Texels(codec)).notes(ids)?.iter().map(Note::cost).collect())
     }
 
     /// What a codec made of some bricks that it was tried on.
@@ -191,12 +221,12 @@ impl Encodings {
     /// # Errors
     /// When the scratch file cannot be read back.
     pub fn texels(&self, ids: &[u32], codec: KeptCodec) -> io::Result<Tried> {
-        let kept = &self.kept[codec as usize];
+        let kept = self.kept(Kind::Texels(codec));
         let notes = kept.notes(ids)?;
         Ok(Tried {
-            costs: notes.iter().map(|[note]| note.cost()).collect(),
+            costs: notes.iter().map(Note::cost).collect(),
             bytes: kept.texels(ids)?,
-            axes: notes.iter().map(|[note]| note.word as u8).collect(),
+            axes: notes.iter().map(|note| note.word as u8).collect(),
         })
     }
 
@@ -227,11 +257,8 @@ impl Encodings {
         Measure::new(brick, carried, self.terms.sign_matters)
     }
 
-    fn is_known(&self, id: u32, kind: Kind) -> bool {
-        match kind {
-            Kind::Plain => self.plain.is_known(id),
-            Kind::Texels(codec) => self.kept[codec as usize].is_known(id),
-        }
+    fn kept(&self, kind: Kind) -> &Kept {
+        &self.kept[kind.index()]
     }
 
     /// Sees to it that some bricks, ascending, are known in every kind. `advance` hears of those that are done.
@@ -252,7 +279,7 @@ impl Encodings {
                 interrupt::check()?;
             }
             let missing: Vec<u32> =
-                window.iter().copied().filter(|&id| kinds.iter().any(|k| !self.is_known(id, *k))).collect();
+                window.iter().copied().filter(|&id| kinds.iter().any(|k| !self.kept(*k).is_known(id))).collect();
             tree.fetch(&missing)?;
             let shared: &SequenceTree = tree;
             // A few bricks are shared out evenly.
@@ -262,7 +289,7 @@ impl Encodings {
             let made: Vec<io::Result<Vec<Made>>> =
                 missing.par_chunks(batch).map(|ids| self.make_batch(shared, ids, kinds)).collect();
             for (ids, made) in missing.chunks(batch).zip(made) {
-                made?.into_iter().try_for_each(|made| self.keep(ids, made))?;
+                made?.iter().zip(kinds).try_for_each(|(made, kind)| self.keep(ids, *kind, made))?;
             }
             self.flush()?;
             for &kind in kinds {
@@ -282,8 +309,11 @@ impl Encodings {
         let texels: Vec<Texels> = ids.iter().zip(bricks).map(|(&id, b)| self.prepare(tree, id, b)).collect();
         let each = || ids.iter().zip(bricks).zip(&texels);
         let made = |kind: &Kind| match *kind {
-            Kind::Plain => Made::Plain(each().map(|((&id, b), t)| self.make_plain(tree, id, b, t)).collect()),
-            Kind::Texels(codec) => Made::Texels(codec, self.make_texels(codec.codec(), bricks, &texels)),
+            Kind::Plain => {
+                let plain = each().map(|((&id, b), t)| self.make_plain(tree, id, b, t));
+                Made { notes: plain.flat_map(Plain::to_notes).collect(), texels: Vec::new() }
+            }
+            Kind::Texels(codec) => self.make_texels(codec.codec(), bricks, &texels),
         };
         Ok(kinds.iter().map(made).collect())
     }
@@ -313,43 +343,35 @@ impl Encodings {
         Plain { value, constant: measure.of(&[value; BRICK_VOXELS], None), empty, f16 }
     }
 
-    fn make_texels(&self, codec: Codec, bricks: &[Brick], texels: &[Texels]) -> Tried {
+    fn make_texels(&self, codec: Codec, bricks: &[Brick], texels: &[Texels]) -> Made {
         let encoded = encode(codec, &self.sequence, texels).expect("only f16 has values that it cannot hold");
         let size = codec.layout().brick_bytes();
         let each = bricks.iter().zip(texels).zip(encoded.bytes.chunks_exact(size)).zip(&encoded.axes);
-        let cost = |(((brick, texels), bytes), &axis): (((&Brick, &Texels), &[u8]), &u8)| {
+        let note = |(((brick, texels), bytes), &axis): (((&Brick, &Texels), &[u8]), &u8)| {
             let decoded = decode(codec, bytes, axis, &self.sequence, texels.range);
             let spread = spread(codec, bytes, &self.sequence, texels.range);
-            self.measure(brick, &texels.carried).of(&decoded, Some(&spread))
+            Note::new(self.measure(brick, &texels.carried).of(&decoded, Some(&spread)), axis.into())
         };
-        Tried { costs: each.map(cost).collect(), bytes: encoded.bytes, axes: encoded.axes }
+        Made { notes: each.map(note).collect(), texels: encoded.bytes }
     }
 
-    fn keep(&mut self, ids: &[u32], made: Made) -> io::Result<()> {
-        match made {
-            Made::Texels(codec, tried) => {
-                let note = |(&cost, &axis)| [Note::new(cost, u32::from(axis))];
-                let notes: Vec<_> = tried.costs.iter().zip(&tried.axes).map(note).collect();
-                self.kept[codec as usize].add(self.rules.len(), ids, &notes, &tried.bytes)
-            }
-            Made::Plain(plain) => {
-                let notes: Vec<_> = plain.into_iter().map(Plain::to_notes).collect();
-                self.plain.add(self.rules.len(), ids, &notes, &[])
-            }
-        }
+    fn keep(&mut self, ids: &[u32], kind: Kind, made: &Made) -> io::Result<()> {
+        self.kept[kind.index()].add(self.rules.len(), ids, made)
     }
 
     /// Sees to it that what was kept can be read.
     fn flush(&mut self) -> io::Result<()> {
-        self.plain.flush()?;
         self.kept.iter_mut().try_for_each(Kept::flush)
     }
 }
 
-/// What was made of a batch, in the order of its bricks.
-enum Made {
-    Plain(Vec<Plain>),
-    Texels(KeptCodec, Tried),
+/// What was made of some bricks in a kind, one brick after another.
+#[derive(Default, Serialize, Deserialize)]
+struct Made {
+    #[serde(with = "pods")]
+    notes: Vec<Note>,
+    #[serde(with = "pods")]
+    texels: Vec<u8>,
 }
 
 /// What a codec made of some bricks.
