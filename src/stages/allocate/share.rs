@@ -34,7 +34,7 @@ const LEAST_NEAR: usize = 128;
 const ROWS: usize = 32;
 /// Borrowers of batches that are compared side by side, so that all cores have work to the end. The lenders of a batch
 /// more to either side are in memory, 2.4 KB each.
-const AT_ONCE: usize = 1024;
+const AT_ONCE: usize = 640;
 /// Lenders that are compared voxel by voxel.
 const CLOSEST: usize = 3;
 /// Values of a shape as it is first compared: means of 2³ voxels.

@@ -19,6 +19,9 @@ use crate::stages::dedup::SequenceTree;
 /// Bricks of a batch: with 512 bytes of texels each, an entry of a megabyte.
 pub const BATCH_BRICKS: u32 = 2048;
 
+/// Entries that a remote is asked for together.
+const PREFETCHED: usize = 64;
+
 const STAGE: Stage = Stage { name: "encode", version: 2, travels: false };
 const BASE: Stage = Stage { name: "batch", version: 1, travels: false };
 
@@ -202,20 +205,34 @@ impl Encodings {
                 }
             }
         }
-        // Some at a time, since an entry is a megabyte.
-        for wanted in wanted.chunks(64) {
-            let batches = &self.batches.all;
-            cache.prefetch(wanted.iter().filter_map(|&(batch, kind)| batches[batch].key(kind)));
-            let found: Vec<Option<Found>> = wanted
-                .par_iter()
-                .map(|&(batch, kind)| batches[batch].find(tree, &cache, kind))
-                .collect::<io::Result<_>>()?;
-            for Found { kind, ids, made } in found.into_iter().flatten() {
-                self.keep(&ids, kind, &made)?;
+        let Self { batches, kept, rules, .. } = self;
+        let batches = &batches.all;
+        let key = |&(batch, kind): &(usize, Kind)| batches[batch].key(kind);
+        let find = |&(batch, kind): &(usize, Kind)| batches[batch].find(tree, &cache, kind);
+        for wanted in wanted.chunks(PREFETCHED) {
+            cache.prefetch(wanted.iter().filter_map(key));
+            let read = |group: &[(usize, Kind)]| -> io::Result<Vec<Option<Found>>> {
+                group.par_iter().map(find).collect()
+            };
+            let mut groups = wanted.chunks(2 * rayon::current_num_threads());
+            let mut found = read(groups.next().unwrap_or_default());
+            loop {
+                // The next ones are read while these are put away.
+                let (next, mut later) = (groups.next(), Ok(Vec::new()));
+                rayon::in_place_scope(|scope| {
+                    let later = &mut later;
+                    next.map(|next| scope.spawn(move |_| *later = read(next)));
+                    found?.into_iter().flatten().try_for_each(|Found { kind, ids, made }| {
+                        kept[kind.index()].add(rules.len(), &ids, &made)
+                    })
+                })?;
+                if next.is_none() {
+                    break;
+                }
+                found = later;
             }
         }
-        self.flush()?;
-        Ok(())
+        self.flush()
     }
 
     /// Keeps what was made and the cache does not have yet.
