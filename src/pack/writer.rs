@@ -153,40 +153,49 @@ impl PackWriter {
     /// # Errors
     /// When the file cannot be written.
     pub fn section(&mut self, raw: &[u8], level: i32) -> io::Result<()> {
-        let chunk_bytes = self.specs[self.sections.len()].chunk_bytes as usize;
-        self.compressed(raw.chunks(chunk_bytes).map(<[u8]>::to_vec), level)
+        self.begin()?;
+        let chunk_bytes = self.specs[self.sections.len() - 1].chunk_bytes as usize;
+        self.compressed(raw.chunks(chunk_bytes).map(<[u8]>::to_vec).collect(), level)
     }
 
-    /// The same for words that are made as they are written.
+    /// The same for words that `write` makes as they are written, and gives some at a time.
     ///
     /// # Errors
-    /// When the file cannot be written.
-    pub fn words(&mut self, words: impl Iterator<Item = u32>, level: i32) -> io::Result<()> {
-        let chunk_words = self.specs[self.sections.len()].chunk_bytes as usize / 4;
-        let mut words = words.peekable();
-        let chunk = || {
-            words.peek()?;
-            let mut chunk = Vec::with_capacity(chunk_words * 4);
-            words.by_ref().take(chunk_words).for_each(|word| chunk.extend_from_slice(&word.to_le_bytes()));
-            Some(chunk)
-        };
-        self.compressed(std::iter::from_fn(chunk), level)
+    /// When the file cannot be written, or `write` fails.
+    pub fn words(
+        &mut self,
+        level: i32,
+        write: impl FnOnce(&mut dyn FnMut(&[u32]) -> io::Result<()>) -> io::Result<()>,
+    ) -> io::Result<()> {
+        self.begin()?;
+        let chunk_bytes = self.specs[self.sections.len() - 1].chunk_bytes as usize;
+        let mut chunks: Vec<Vec<u8>> = Vec::new();
+        let mut left = 0;
+        write(&mut |words| {
+            let mut bytes: &[u8] = bytemuck::cast_slice(words);
+            while !bytes.is_empty() {
+                if left == 0 {
+                    if chunks.len() == rayon::current_num_threads() {
+                        self.compressed(std::mem::take(&mut chunks), level)?;
+                    }
+                    chunks.push(Vec::with_capacity(chunk_bytes));
+                    left = chunk_bytes;
+                }
+                let (now, later) = bytes.split_at(left.min(bytes.len()));
+                chunks.last_mut().expect("one was begun").extend_from_slice(now);
+                left -= now.len();
+                bytes = later;
+            }
+            Ok(())
+        })?;
+        self.compressed(chunks, level)
     }
 
-    /// Begins a section and writes its chunks, which are encoded side by side.
-    fn compressed(&mut self, mut chunks: impl Iterator<Item = Vec<u8>>, level: i32) -> io::Result<()> {
-        let encoding = self.specs[self.sections.len()].encoding;
-        self.begin()?;
-        loop {
-            let group: Vec<Vec<u8>> = chunks.by_ref().take(rayon::current_num_threads()).collect();
-            if group.is_empty() {
-                return Ok(());
-            }
-            let group = group.into_par_iter().map(|raw| compress_chunk(raw, encoding, level));
-            for chunk in group.collect::<io::Result<Vec<_>>>()? {
-                self.chunk(&chunk)?;
-            }
-        }
+    /// Writes the next chunks, which are encoded side by side.
+    fn compressed(&mut self, chunks: Vec<Vec<u8>>, level: i32) -> io::Result<()> {
+        let encoding = self.specs[self.sections.len() - 1].encoding;
+        let stored = chunks.into_par_iter().map(|raw| compress_chunk(raw, encoding, level));
+        stored.collect::<io::Result<Vec<_>>>()?.iter().try_for_each(|chunk| self.chunk(chunk))
     }
 
     /// Fills in the tables and syncs. The file is whole then, but not yet in its place.

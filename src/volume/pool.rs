@@ -7,7 +7,7 @@ use bytemuck::{Pod, Zeroable};
 use hashbrown::HashTable;
 use xxhash_rust::xxh3::{xxh3_64, xxh3_128};
 
-use super::{BRICK_VOXELS, Brick, List, Mask512, SCRATCH_HEAD, Scratch};
+use super::{BRICK_VOXELS, Brick, List, Mask512, SCRATCH_SMALL, Scratch};
 
 /// Bricks that are worked on before what was made of them is put away: enough batches of an encoder for every core.
 pub const BRICKS_IN_FLIGHT: u32 = 4096;
@@ -72,7 +72,7 @@ impl Default for BrickPool {
             by_digest: HashTable::new(),
             starts: List::default(),
             bricks: List::default(),
-            facts: Scratch::new(size_of::<Facts>(), SCRATCH_HEAD),
+            facts: Scratch::new(size_of::<Facts>(), SCRATCH_SMALL),
             values: Scratch::new(BRICK_VOXELS * 4, 0),
         }
     }

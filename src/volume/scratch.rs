@@ -12,28 +12,33 @@ const BLOCK: usize = 128 << 10;
 /// Bytes between two records that are read through rather than skipped: a call to the system costs about as much.
 const GAP: u64 = 16 << 10;
 
-/// What of small records stays in memory: those of some thousand bricks, which is a sequence of a second.
-pub const SCRATCH_HEAD: usize = 256 << 10;
+/// Small records are in memory while they are no more than this: those of some thousand bricks, which is a sequence of a
+/// second.
+pub const SCRATCH_SMALL: usize = 256 << 10;
 
-/// Records by their places, which may be filled in any order; one after another is the quickest. The file is made with
-/// the first of them.
+/// Records by their places, which may be filled in any order; one after another is the quickest.
 pub struct Scratch {
     record: usize,
-    /// The file's first bytes, up to `most`, which it does not have.
-    head: Vec<u8>,
-    most: usize,
-    file: Option<File>,
+    store: Store,
+    /// Bytes that may be in memory.
+    small: usize,
     /// Put, and not in the file yet.
     buffer: Vec<u8>,
     /// The place of the first of those.
     buffered: u32,
 }
 
+enum Store {
+    /// While it is little.
+    Memory(Vec<u8>),
+    File(File),
+}
+
 impl Scratch {
-    /// None yet, of that many bytes each. The first `head` bytes of all stay in memory: a short sequence then needs no
-    /// file for what is small.
-    pub fn new(record: usize, head: usize) -> Self {
-        Self { record, head: Vec::new(), most: head, file: None, buffer: Vec::new(), buffered: 0 }
+    /// None yet, of that many bytes each. Until there are more than `small` bytes they stay in memory: a short sequence
+    /// then needs no file for what is small.
+    pub fn new(record: usize, small: usize) -> Self {
+        Self { record, store: Store::Memory(Vec::new()), small, buffer: Vec::new(), buffered: 0 }
     }
 
     /// Bytes of each.
@@ -84,39 +89,31 @@ impl Scratch {
     }
 
     fn write(&mut self, at: u64, bytes: &[u8]) -> io::Result<()> {
-        let (early, late) = bytes.split_at(self.in_head(at, bytes.len()));
-        if !early.is_empty() {
-            let end = at as usize + early.len();
-            self.head.resize(self.head.len().max(end), 0);
-            self.head[at as usize..end].copy_from_slice(early);
+        let end = at as usize + bytes.len();
+        if let Store::Memory(all) = &mut self.store {
+            if end <= self.small {
+                all.resize(all.len().max(end), 0);
+                all[at as usize..end].copy_from_slice(bytes);
+                return Ok(());
+            }
+            let file = tempfile::tempfile()?;
+            write_at(&file, all, 0)?;
+            self.store = Store::File(file);
         }
-        if late.is_empty() {
-            return Ok(());
+        match &self.store {
+            Store::File(file) => write_at(file, bytes, at),
+            Store::Memory(_) => unreachable!("it is a file from now on"),
         }
-        // Whoever reads across the end of the head finds all of it.
-        self.head.resize(self.most, 0);
-        let file = match &mut self.file {
-            Some(file) => file,
-            none => none.insert(tempfile::tempfile()?),
-        };
-        write_at(file, late, at + early.len() as u64)
     }
 
     fn load(&self, at: u64, bytes: &mut [u8]) -> io::Result<()> {
-        let (early, late) = bytes.split_at_mut(self.in_head(at, bytes.len()));
-        if !early.is_empty() {
-            early.copy_from_slice(&self.head[at as usize..][..early.len()]);
+        match &self.store {
+            Store::Memory(all) => {
+                bytes.copy_from_slice(&all[at as usize..][..bytes.len()]);
+                Ok(())
+            }
+            Store::File(file) => read_at(file, bytes, at),
         }
-        if late.is_empty() {
-            return Ok(());
-        }
-        let file = self.file.as_ref().expect("records are flushed before they are read");
-        read_at(file, late, at + early.len() as u64)
-    }
-
-    /// How many of some bytes are in memory.
-    fn in_head(&self, at: u64, len: usize) -> usize {
-        (self.most as u64).saturating_sub(at).min(len as u64) as usize
     }
 
     fn load_span(&self, places: &[u32], bytes: &mut Vec<u8>) -> io::Result<u64> {
@@ -236,8 +233,8 @@ mod tests {
 
     #[test]
     fn records_come_back_in_the_order_asked_for() {
-        for head in [0, 100_000] {
-            records_come_back(Scratch::new(8, head));
+        for small in [0, 100_000, 1 << 20] {
+            records_come_back(Scratch::new(8, small));
         }
     }
 

@@ -19,7 +19,7 @@ use half::f16;
 use super::dedup::SequenceTree;
 use super::encodings::Encodings;
 use crate::codec::{BrickRange, Codec, OutOfRange, SequenceRange};
-use crate::volume::{SCRATCH_HEAD, Scratch, Sparse, ValueRange};
+use crate::volume::{SCRATCH_SMALL, Scratch, Sparse, ValueRange};
 
 pub use adaptive::{AdaptiveGrid, Target, adaptive};
 pub use cluster::clustered;
@@ -100,7 +100,7 @@ pub enum AllocateError {
 impl Norms {
     /// None yet.
     fn new() -> Self {
-        Self { norms: Scratch::new(size_of::<f64>(), SCRATCH_HEAD), are_known: false }
+        Self { norms: Scratch::new(size_of::<f64>(), SCRATCH_SMALL), are_known: false }
     }
 
     /// Notes those of bricks, one after another.

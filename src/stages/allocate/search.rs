@@ -416,7 +416,7 @@ impl<'a> GridSearch<'a> {
             let squares = allocation.norms.read(&empty)?.into_iter().map(|norm| norm.powi(2));
             allocation.empty_squares.push(squares.sum());
         }
-        tree.prune(is_empty);
+        tree.prune(is_empty)?;
         Ok(allocation)
     }
 }

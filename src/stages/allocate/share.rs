@@ -121,7 +121,8 @@ pub(super) fn loans(
         if let Some(cache) = encodings.cache() {
             cache.prefetch(keys.iter().copied().flatten());
         }
-        let known = comparisons.par_iter().zip(&keys).map(|(comparison, key)| comparison.known(encodings, *key));
+        let known =
+            comparisons.par_iter().zip(&keys).map(|(comparison, key)| comparison.known(encodings, *key));
         let mut known: Vec<Option<Offers>> = known.collect();
         // Frames whose voxels are not there are read side by side.
         let unknown = comparisons.iter().zip(&known).filter(|(_, known)| known.is_none());

@@ -168,7 +168,7 @@ fn saved_bytes(searches: &[GridSearch], picks: &[Vec<Rung>]) -> u64 {
             Payload::Constant(_) => false,
         };
         let records = tree.runs.items().iter().filter(|entry| is_empty(entry)).count() as u64;
-        let nodes = tree.nodes.items().iter().filter(|node| node.entries(&tree.runs).iter().all(is_empty));
+        let nodes = tree.nodes.all().iter().filter(|node| node.entries(&tree.runs).iter().all(is_empty));
         records * u64::from(RECORD_BITS / 8) + nodes.count() as u64 * NODE_WORDS as u64 * 4
     };
     searches.iter().zip(picks).map(of_grid).sum()

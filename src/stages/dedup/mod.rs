@@ -4,6 +4,7 @@
 //! again. Everything here is exact: two things are one only if their bits are. None of it needs voxels: those of a
 //! frame that is known from its [`Outline`] are fetched when someone asks for them.
 
+mod nodes;
 mod outline;
 
 use std::collections::{BTreeSet, HashMap};
@@ -18,6 +19,7 @@ use crate::volume::{
     Sparse, ValueRange, bits,
 };
 
+pub use nodes::{Node, Nodes};
 pub use outline::{BrickOutline, MaskPolicy, Outline, Values, carried};
 
 /// One grid of a sequence, with everything that repeats stored once.
@@ -27,7 +29,7 @@ pub struct SequenceTree {
     /// The frames, in the order in which they were added.
     pub frames: Vec<FrameTree>,
     /// The distinct L2 nodes.
-    pub nodes: Interner<Node>,
+    pub nodes: Nodes,
     /// Runs of entries that [`SequenceTree::record`] understands, one run a distinct list of children.
     pub runs: Interner<u32>,
     /// The distinct L3 records of which more is to be said than which brick they are.
@@ -67,28 +69,6 @@ pub enum CellRef {
     Constant(Constant),
     /// The L2 node at this place of [`SequenceTree::nodes`].
     Node(u32),
-}
-
-/// An L2 node: which of its 4096 children exist, and where the run of their records begins.
-#[derive(Clone, Copy, bytemuck::Pod, bytemuck::Zeroable)]
-#[repr(C)]
-pub struct Node {
-    /// One bit a child, x slowest.
-    pub children: [u64; 64],
-    /// The place of the first child's entry in [`SequenceTree::runs`].
-    pub run: u64,
-}
-
-impl Node {
-    /// How many children there are.
-    pub fn child_count(&self) -> usize {
-        self.children.iter().map(|w| w.count_ones() as usize).sum()
-    }
-
-    /// The node's entries in `runs`.
-    pub fn entries<'a>(&self, runs: &'a Interner<u32>) -> &'a [u32] {
-        &runs.items()[self.run as usize..][..self.child_count()]
-    }
 }
 
 /// One distinct 8³ region.
@@ -173,7 +153,7 @@ impl SequenceTree {
         Self {
             background: 0.0,
             frames: Vec::new(),
-            nodes: Interner::default(),
+            nodes: Nodes::default(),
             runs: Interner::default(),
             records: List::default(),
             masks: Interner::default(),
@@ -193,7 +173,7 @@ impl SequenceTree {
     pub fn seal(&mut self) -> io::Result<()> {
         self.record_of_brick = Sparse::default();
         self.record_of_constant = HashMap::new();
-        self.nodes.seal();
+        self.nodes.seal()?;
         self.runs.seal();
         self.masks.seal();
         self.pool.seal()
@@ -212,10 +192,10 @@ impl SequenceTree {
             let content = match cell.content {
                 CellContent::Constant(constant) => CellRef::Constant(constant),
                 CellContent::Node(children) => {
-                    let mut node = Node { children: [0; 64], run: 0 };
+                    let mut places = [0; 64];
                     run.clear();
                     for (place, child) in children {
-                        node.children[usize::from(place) >> 6] |= 1 << (place & 63);
+                        places[usize::from(place) >> 6] |= 1 << (place & 63);
                         run.push(match child {
                             Child::Constant(constant) => self.constant_region(constant),
                             Child::Brick(brick) => {
@@ -223,8 +203,7 @@ impl SequenceTree {
                             }
                         });
                     }
-                    node.run = self.runs.intern(&run).into();
-                    CellRef::Node(self.nodes.intern(&[node]))
+                    CellRef::Node(self.nodes.intern(&places, self.runs.intern(&run))?)
                 }
             };
             cells.push((cell.origin, content));
@@ -359,7 +338,7 @@ impl SequenceTree {
     /// The bricks of the pool that a frame uses, shared ones each time.
     pub fn frame_bricks<'a>(&'a self, frame: &'a FrameTree) -> impl Iterator<Item = u32> + 'a {
         let nodes = frame.cells.iter().filter_map(|(_, content)| match content {
-            CellRef::Node(node) => Some(&self.nodes.items()[*node as usize]),
+            CellRef::Node(node) => Some(&self.nodes.all()[*node as usize]),
             CellRef::Constant(_) => None,
         });
         let records = nodes.flat_map(|node| node.entries(&self.runs)).map(|&entry| self.record(entry));
@@ -370,32 +349,34 @@ impl SequenceTree {
     }
 
     /// Takes bricks out of the tree: what was there is background then. Nodes without a child go too.
-    pub fn prune(&mut self, is_empty: impl Fn(u32) -> bool) {
+    ///
+    /// # Errors
+    /// When the scratch file fails.
+    pub fn prune(&mut self, is_empty: impl Fn(u32) -> bool) -> io::Result<()> {
         let (nodes, runs) = (std::mem::take(&mut self.nodes), std::mem::take(&mut self.runs));
-        let mut moved: Vec<Option<u32>> = Vec::with_capacity(nodes.items().len());
+        let mut moved: Vec<Option<u32>> = Vec::with_capacity(nodes.all().len());
         let mut run = Vec::new();
-        for node in nodes.items() {
-            let mut left = Node { children: [0; 64], run: 0 };
+        nodes.visit(|node, children| {
+            let mut left = [0; 64];
             run.clear();
-            for (place, &entry) in bits(&node.children).zip(node.entries(&runs)) {
+            for (place, &entry) in bits(children).zip(node.entries(&runs)) {
                 if !matches!(self.record(entry).payload(), Payload::Brick(id) if is_empty(id)) {
-                    left.children[place >> 6] |= 1 << (place & 63);
+                    left[place >> 6] |= 1 << (place & 63);
                     run.push(entry);
                 }
             }
-            moved.push((!run.is_empty()).then(|| {
-                left.run = self.runs.intern(&run).into();
-                self.nodes.intern(&[left])
-            }));
-        }
+            let node = (!run.is_empty()).then(|| self.nodes.intern(&left, self.runs.intern(&run)));
+            moved.push(node.transpose()?);
+            Ok(())
+        })?;
         for frame in &mut self.frames {
             frame.cells.retain_mut(|(_, content)| match content {
                 CellRef::Constant(_) => true,
                 CellRef::Node(node) => moved[*node as usize].inspect(|to| *node = *to).is_some(),
             });
         }
-        self.nodes.seal();
         self.runs.seal();
+        self.nodes.seal()
     }
 
     /// The range of everything that is active or carried by a texel; `None` for an empty sequence.

@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 use crate::cache::pods;
 use crate::stages::flatten::Flattened;
 use crate::volume::{
-    Brick, BrickPool, CELL_DIM, Cell, CellContent, Child, Constant, Coord, FlatFrame, FrameStats, InactiveRule,
-    Mask512, ROOT_DIM, ValueRange,
+    Brick, BrickPool, CELL_DIM, Cell, CellContent, Child, Constant, Coord, FlatFrame, FrameStats,
+    InactiveRule, Mask512, ROOT_DIM, ValueRange,
 };
 
 /// Whether bricks keep their active masks.

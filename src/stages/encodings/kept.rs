@@ -5,7 +5,7 @@ use std::io;
 use bytemuck::{Pod, Zeroable};
 
 use super::{Cost, KeptCodec, Kind, Made};
-use crate::volume::{SCRATCH_HEAD, Scratch};
+use crate::volume::{SCRATCH_SMALL, Scratch};
 
 /// A [`Cost`], and something more of what it is the cost of.
 #[derive(Clone, Copy, Pod, Zeroable)]
@@ -96,7 +96,7 @@ impl Kept {
     pub fn new(kind: Kind) -> Self {
         Self {
             places: Places::new(kind),
-            notes: Scratch::new(kind.notes() * size_of::<Note>(), SCRATCH_HEAD),
+            notes: Scratch::new(kind.notes() * size_of::<Note>(), SCRATCH_SMALL),
             texels: (kind.texels() > 0).then(|| Scratch::new(kind.texels(), 0)),
         }
     }

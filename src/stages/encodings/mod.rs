@@ -278,8 +278,11 @@ impl Encodings {
                 self.save(tree)?;
                 interrupt::check()?;
             }
-            let missing: Vec<u32> =
-                window.iter().copied().filter(|&id| kinds.iter().any(|k| !self.kept(*k).is_known(id))).collect();
+            let missing: Vec<u32> = window
+                .iter()
+                .copied()
+                .filter(|&id| kinds.iter().any(|k| !self.kept(*k).is_known(id)))
+                .collect();
             tree.fetch(&missing)?;
             let shared: &SequenceTree = tree;
             // A few bricks are shared out evenly.

@@ -150,7 +150,7 @@ pub fn serialise(
     writer.section(bytemuck::cast_slice(&lists), level)?;
     writer.section(&provenance, level)?;
     writer.section(bytemuck::cast_slice(&frames), level)?;
-    writer.words(words.words(grids, &layout, &outcomes), level)?;
+    writer.words(level, |sink| words.write(grids, &layout, &outcomes, sink))?;
     Ok(writer.finish()?)
 }
 

@@ -1,6 +1,7 @@
 //! The words of the tree section, as `docs/format.md`, "The tree", has them.
 
 use std::collections::BTreeMap;
+use std::io;
 
 use super::{GridInput, SerialiseError, too_large};
 use crate::codec::Codec;
@@ -118,7 +119,7 @@ impl TreeWords {
             for frame in &grid.tree.frames {
                 roots.extend(frame_roots(frame, bounds, l1_at, nodes, &mut l1, &mut constants));
             }
-            nodes += grid.tree.nodes.items().len() as u32;
+            nodes += grid.tree.nodes.all().len() as u32;
         }
 
         let node_at = l1_at + l1.items().len();
@@ -164,31 +165,35 @@ impl TreeWords {
         self.len
     }
 
-    /// All of them.
-    pub fn words<'a>(
-        &'a self,
-        grids: &'a [GridInput],
-        layout: &'a Layout,
-        outcomes: &'a [Outcome],
-    ) -> impl Iterator<Item = u32> + 'a {
-        let nodes = with_first(grids, run_len).flat_map(|(grid, first_record)| {
-            grid.tree.nodes.items().iter().flat_map(move |node| {
-                let mut words: Vec<u32> =
-                    node.children.iter().flat_map(|w| [*w as u32, (w >> 32) as u32]).collect();
-                words.extend(tree::ranks(&words));
-                words.push(first_record + node.run as u32);
-                words
-            })
-        });
-        let each = with_first(grids, mask_len).enumerate().zip(outcomes);
-        let records = each.flat_map(move |((g, (grid, first_mask)), outcome)| {
-            let slot = move |id| layout.slot(g, id);
-            let words = move |&entry| l3_record(grid, entry, slot, outcome, first_mask).to_words();
-            grid.tree.runs.items().iter().flat_map(words)
-        });
-        let masks = grids.iter().flat_map(|grid| grid.tree.masks.items()).flat_map(|mask| mask.to_words());
-        let head = self.head.iter().copied();
-        head.chain(nodes).chain(records).chain(masks).chain(self.constants.iter().copied())
+    /// Gives all of them to `sink`, some at a time.
+    ///
+    /// # Errors
+    /// When a scratch file cannot be read back, or the sink fails.
+    pub fn write(
+        &self,
+        grids: &[GridInput],
+        layout: &Layout,
+        outcomes: &[Outcome],
+        mut sink: impl FnMut(&[u32]) -> io::Result<()>,
+    ) -> io::Result<()> {
+        sink(&self.head)?;
+        for (grid, first_record) in with_first(grids, run_len) {
+            grid.tree.nodes.visit(|node, children| {
+                let words: [u32; 128] = bytemuck::cast(*children);
+                sink(&words)?;
+                sink(&tree::ranks(&words))?;
+                sink(&[first_record + node.run])
+            })?;
+        }
+        for ((g, (grid, first_mask)), outcome) in with_first(grids, mask_len).enumerate().zip(outcomes) {
+            let slot = |id| layout.slot(g, id);
+            for &entry in grid.tree.runs.items() {
+                sink(&l3_record(grid, entry, slot, outcome, first_mask).to_words())?;
+            }
+        }
+        let mut masks = grids.iter().flat_map(|grid| grid.tree.masks.items());
+        masks.try_for_each(|mask| sink(&mask.to_words()))?;
+        sink(&self.constants)
     }
 }
 
