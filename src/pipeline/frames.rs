@@ -16,7 +16,7 @@ use crate::stages::select::{SelectedGrid, Selection, find};
 use crate::stages::serialise::{FrameInput, GridInput};
 use crate::trace;
 use crate::vdb::{GridClass, VdbFile};
-use crate::volume::{Brick, FlatFrame};
+use crate::volume::{Blocks, Brick, FlatFrame};
 
 /// What frames pass through before anything is made of them.
 pub type Alter<'a> = &'a (dyn Fn(&mut FlatFrame) + Sync);
@@ -24,7 +24,7 @@ pub type Alter<'a> = &'a (dyn Fn(&mut FlatFrame) + Sync);
 const OUTLINE: Stage = Stage { name: "outline", version: 2, travels: false };
 
 /// One grid of one frame, with its voxels unless they were not needed so far.
-type Frame = (Outline, Option<Vec<Brick>>);
+type Frame = (Outline, Option<Blocks<Brick>>);
 
 /// Reads frames, as many at a time as there are threads, and adds them in order: twice as many are in memory.
 pub(super) fn read(

@@ -4,9 +4,10 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 use crate::settings::NonFinite;
-use crate::vdb::{GridInfo, Scalar, Tree, VdbFile, with_scalar_type};
+use crate::vdb::{GridInfo, LEAVES_IN_BLOCK, Scalar, Tree, VdbFile, with_scalar_type};
 use crate::volume::{
-    Brick, CELL_DIM, Cell, CellContent, Child, Constant, Coord, FlatFrame, FrameStats, ValueRange,
+    BRICK_VOXELS, Brick, CELL_DIM, Cell, CellContent, Child, Constant, Coord, FlatFrame, FrameStats, Mask512,
+    ValueRange,
 };
 
 /// A flattened frame, and the value outside everything in it.
@@ -28,7 +29,7 @@ pub fn flatten(
     nonfinite: NonFinite,
 ) -> Result<Flattened> {
     let flat = with_scalar_type!(&grid.value_type,
-        T => flatten_tree(&file.read_tree::<T>(grid).map_err(Error::vdb(path))?, nonfinite),
+        T => flatten_tree(file.read_tree::<T>(grid).map_err(Error::vdb(path))?, nonfinite),
         other => unreachable!("{} grids are refused when grids are selected", other.name())
     );
     let count = flat.frame.stats.nonfinite;
@@ -58,27 +59,30 @@ struct LeafSummary {
     nonfinite: u64,
 }
 
-fn flatten_tree<T: Scalar>(tree: &Tree<T>, nonfinite: NonFinite) -> Flattened {
+fn flatten_tree<T: Scalar>(mut tree: Tree<T>, nonfinite: NonFinite) -> Flattened {
     let mut f = Flattener { background: 0.0, nonfinite_count: 0, nonfinite, active_range: None };
     f.background = f.value(tree.background);
     let background = f.background;
 
-    let summaries: Vec<LeafSummary> = (0..tree.leaves.len())
-        .into_par_iter()
-        .map(|i| summarise(&brick(tree, i, nonfinite), tree, i, background))
-        .collect();
+    // A block of leaves is gone as soon as its bricks are made.
+    let blocks = std::mem::take(&mut tree.leaves.blocks).into_par_iter();
+    let (summaries, bricks): (Vec<Vec<LeafSummary>>, Vec<Vec<Brick>>) = blocks
+        .zip(tree.leaves.masks.par_chunks(LEAVES_IN_BLOCK))
+        .map(|(values, masks)| bricks(values, masks, background, nonfinite))
+        .unzip();
+    let summaries: Vec<LeafSummary> = summaries.into_iter().flatten().collect();
 
     let mut roots = Vec::new();
     for tile in &tree.tiles {
         roots.extend(f.tile(tile.value, tile.active).map(|c| (tile.origin, c)));
     }
     let mut cells = Vec::new();
-    let mut brick_leaves = Vec::new();
+    let mut brick_count = 0;
     for l1 in &tree.l1 {
         let mut l2 = l1.first_child;
         for i in 0..l1.tiles.len() {
             let content = if l1.is_child(i) {
-                let children = f.children(&tree.l2[l2], &summaries, &mut brick_leaves);
+                let children = f.children(&tree.l2[l2], &summaries, &mut brick_count);
                 l2 += 1;
                 (!children.is_empty()).then_some(CellContent::Node(children))
             } else {
@@ -88,8 +92,6 @@ fn flatten_tree<T: Scalar>(tree: &Tree<T>, nonfinite: NonFinite) -> Flattened {
             cells.extend(content.map(|content| Cell { origin, content }));
         }
     }
-    let bricks = brick_leaves.par_iter().map(|&leaf| brick(tree, leaf, nonfinite)).collect();
-
     let topology = tree.topology_stats();
     let leaf_range = ValueRange::union_all(summaries.iter().filter_map(|s| s.active_range));
     let stats = FrameStats {
@@ -101,7 +103,7 @@ fn flatten_tree<T: Scalar>(tree: &Tree<T>, nonfinite: NonFinite) -> Flattened {
         nonfinite: f.nonfinite_count + summaries.iter().map(|s| s.nonfinite).sum::<u64>(),
     };
     // A file may list its root entries in any order, and cells are numbered within one entry.
-    let mut frame = FlatFrame { roots, cells, bricks, stats };
+    let mut frame = FlatFrame { roots, cells, bricks: bricks.into(), stats };
     frame.sort();
     Flattened { frame, background }
 }
@@ -130,12 +132,13 @@ impl Flattener {
         (active || value.to_bits() != self.background.to_bits()).then_some(Constant { value, active })
     }
 
-    /// The children of an L2 node by their place; leaves that are bricks are numbered as they come.
+    /// The children of an L2 node by their place; leaves that are bricks are numbered as they come, which is the order of
+    /// leaves.
     fn children<T: Scalar>(
         &mut self,
         node: &crate::vdb::Internal<T>,
         summaries: &[LeafSummary],
-        brick_leaves: &mut Vec<usize>,
+        brick_count: &mut u32,
     ) -> Vec<(u16, Child)> {
         let mut leaf = node.first_child;
         let mut children = Vec::new();
@@ -146,8 +149,8 @@ impl Flattener {
                     LeafKind::Background => None,
                     LeafKind::Constant(constant) => Some(Child::Constant(constant)),
                     LeafKind::Brick => {
-                        brick_leaves.push(leaf - 1);
-                        Some(Child::Brick(brick_leaves.len() as u32 - 1))
+                        *brick_count += 1;
+                        Some(Child::Brick(*brick_count - 1))
                     }
                 }
             } else {
@@ -163,22 +166,37 @@ fn finite(value: f32, nonfinite: NonFinite) -> f32 {
     if value.is_finite() || nonfinite == NonFinite::Refuse { value } else { 0.0 }
 }
 
-fn brick<T: Scalar>(tree: &Tree<T>, leaf: usize, nonfinite: NonFinite) -> Brick {
-    let source = tree.leaves.values(leaf);
-    let values = std::array::from_fn(|i| finite(source[i].to_f32(), nonfinite));
-    Brick { values, active: tree.leaves.masks[leaf], keeps_mask: true }
-}
-
-fn summarise<T: Scalar>(brick: &Brick, tree: &Tree<T>, leaf: usize, background: f32) -> LeafSummary {
-    let nonfinite = tree.leaves.values(leaf).iter().filter(|v| !v.to_f32().is_finite()).count() as u64;
-    let active = tree.leaves.masks[leaf];
-    let kind = match brick.constant() {
-        Some(c) if !c.active && c.value.to_bits() == background.to_bits() => LeafKind::Background,
-        Some(constant) => LeafKind::Constant(constant),
-        None => LeafKind::Brick,
+/// What becomes of a block of leaves, and those that are bricks.
+fn bricks<T: Scalar>(
+    values: Vec<T>,
+    masks: &[Mask512],
+    background: f32,
+    nonfinite: NonFinite,
+) -> (Vec<LeafSummary>, Vec<Brick>) {
+    let mut bricks = Vec::with_capacity(masks.len());
+    let leaves = values.as_chunks::<BRICK_VOXELS>().0.iter().zip(masks);
+    let summary = |(values, &active): (&[T; BRICK_VOXELS], &Mask512)| {
+        // Made where it stays if it is one: copying it costs as much as looking at it.
+        let values = std::array::from_fn(|i| values[i].to_f32());
+        bricks.push(Brick { values, active, keeps_mask: true });
+        let brick = bricks.last_mut().expect("one was pushed");
+        let odd = brick.values.iter().filter(|v| !v.is_finite()).count() as u64;
+        if odd > 0 {
+            brick.values.iter_mut().for_each(|v| *v = finite(*v, nonfinite));
+        }
+        let active_range = brick.range_over(&active).map(|(min, max)| ValueRange { min, max });
+        let kind = match brick.constant() {
+            Some(c) if !c.active && c.value.to_bits() == background.to_bits() => LeafKind::Background,
+            Some(constant) => LeafKind::Constant(constant),
+            None => LeafKind::Brick,
+        };
+        if !matches!(kind, LeafKind::Brick) {
+            bricks.pop();
+        }
+        LeafSummary { kind, active_range, nonfinite: odd }
     };
-    let active_range = brick.range_over(&active).map(|(min, max)| ValueRange { min, max });
-    LeafSummary { kind, active_range, nonfinite }
+    let summaries = leaves.map(summary).collect();
+    (summaries, bricks)
 }
 
 impl FlatFrame {
@@ -189,16 +207,19 @@ impl FlatFrame {
             return;
         }
         self.cells.sort_by_key(|c| c.origin);
-        let mut moved: Vec<Option<Brick>> = std::mem::take(&mut self.bricks).into_iter().map(Some).collect();
+        let bricks = std::mem::replace(&mut self.bricks, Vec::new().into());
+        let mut moved: Vec<Option<Brick>> = bricks.into_iter().map(Some).collect();
+        let mut bricks = Vec::with_capacity(moved.len());
         for cell in &mut self.cells {
             let CellContent::Node(children) = &mut cell.content else { continue };
             for (_, child) in children {
                 if let Child::Brick(brick) = child {
                     let taken = moved[*brick as usize].take().expect("each brick is named once");
-                    *brick = self.bricks.len() as u32;
-                    self.bricks.push(taken);
+                    *brick = bricks.len() as u32;
+                    bricks.push(taken);
                 }
             }
         }
+        self.bricks = vec![bricks].into();
     }
 }

@@ -16,7 +16,7 @@ impl Bricks {
     /// Those of the source.
     pub fn of_source(frame: &FlatFrame) -> Self {
         let order = frame.brick_origins();
-        let each = order.iter().zip(&frame.bricks);
+        let each = order.iter().zip(frame.bricks.iter());
         Self { by_origin: each.map(|(at, b)| (*at, (Box::new(b.values), b.active))).collect(), order }
     }
 

@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use super::tree::Tree;
 use super::value::{Scalar, Value};
-use crate::volume::{BRICK_DIM, BRICK_VOXELS, CELL_DIM, Coord, CoordBox, Mask512, ROOT_DIM};
+use crate::volume::{BRICK_DIM, CELL_DIM, Coord, CoordBox, Mask512, ROOT_DIM};
 
 /// What the masks of a tree say.
 #[derive(Clone, Debug, PartialEq)]
@@ -93,17 +93,13 @@ impl<T: Value> Tree<T> {
 impl<T: Scalar> Tree<T> {
     /// Sums values. Leaf by leaf in a fixed order, so that the sum does not depend on threads.
     pub fn value_stats(&self) -> ValueStats<T> {
-        let leaves: Vec<ValueStats<T>> = self
-            .leaves
-            .masks
-            .par_iter()
-            .zip(self.leaves.values.as_chunks::<BRICK_VOXELS>().0)
-            .map(|(mask, values)| {
-                let mut stats = ValueStats::EMPTY;
-                mask.ones().for_each(|i| stats.add(values[i], 1));
-                stats
-            })
-            .collect();
+        let of_leaf = |leaf: usize| {
+            let (mask, values) = (&self.leaves.masks[leaf], self.leaves.values(leaf));
+            let mut stats = ValueStats::EMPTY;
+            mask.ones().for_each(|i| stats.add(values[i], 1));
+            stats
+        };
+        let leaves: Vec<ValueStats<T>> = (0..self.leaves.len()).into_par_iter().map(of_leaf).collect();
         let mut stats = ValueStats::EMPTY;
         for leaf in leaves {
             stats.sum += leaf.sum;

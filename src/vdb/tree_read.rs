@@ -7,13 +7,10 @@ use rayon::prelude::*;
 use super::block::{Block, Layout, Scratch};
 use super::cursor::Cursor;
 use super::grid::GridInfo;
-use super::tree::{Internal, Leaves, RootTile, Tree};
+use super::tree::{Internal, LEAVES_IN_BLOCK, Leaves, RootTile, Tree};
 use super::value::{Value, ValueType};
 use super::{Result, VdbError};
 use crate::volume::{BRICK_DIM, BRICK_VOXELS, CELL_DIM, Coord, Mask512, ROOT_DIM, bits};
-
-/// Leaves a thread decodes before it takes more work: about 100 µs.
-const LEAVES_PER_JOB: usize = 64;
 
 /// Reads the tree whose first byte is at the cursor and leaves the cursor behind its topology: masks
 /// and tile values, but no leaf values.
@@ -30,7 +27,7 @@ pub(super) fn read_topology<T: Value>(c: &mut Cursor, grid: &GridInfo) -> Result
         tiles: Vec::new(),
         l1: Vec::new(),
         l2: Vec::new(),
-        leaves: Leaves { origins: Vec::new(), masks: Vec::new(), values: Vec::new() },
+        leaves: Leaves { origins: Vec::new(), masks: Vec::new(), blocks: Vec::new() },
     };
     let (tiles, children) = (c.u32("the root's tile count")?, c.u32("the root's child count")?);
     let mut seen = HashSet::new();
@@ -134,20 +131,23 @@ pub(super) fn read_leaves<T: Value>(c: &mut Cursor, grid: &GridInfo, tree: &mut 
         Block::find(c, &layout, &mask.0, BRICK_VOXELS)?;
     }
 
-    tree.leaves.values = vec![T::default(); tree.leaves.len() * BRICK_VOXELS];
-    let (values, _) = tree.leaves.values.as_chunks_mut::<BRICK_VOXELS>();
     let start = &*c;
-    values
-        .par_iter_mut()
-        .zip(&mut tree.leaves.masks)
-        .zip(&places)
-        .with_min_len(LEAVES_PER_JOB)
-        .try_for_each_init(Scratch::default, |scratch, ((values, mask), &place)| {
+    let decode = |scratch: &mut Scratch, (masks, places): (&mut [Mask512], &[usize])| {
+        let mut block = vec![T::default(); masks.len() * BRICK_VOXELS];
+        let leaves = block.as_chunks_mut::<BRICK_VOXELS>().0.iter_mut();
+        for ((values, mask), &place) in leaves.zip(masks).zip(places) {
             let mut c = start.seek(place);
             // The mask before the values is the one that counts: OpenVDB overwrites the other.
             *mask = Mask512::from_bytes(c.array("a leaf's mask")?);
-            Block::find(&mut c, &layout, &mask.0, BRICK_VOXELS)?.decode(&layout, &mask.0, values, scratch)
-        })
+            let found = Block::find(&mut c, &layout, &mask.0, BRICK_VOXELS)?;
+            found.decode(&layout, &mask.0, values, scratch)?;
+        }
+        Ok(block)
+    };
+    let masks = tree.leaves.masks.par_chunks_mut(LEAVES_IN_BLOCK);
+    let blocks = masks.zip(places.par_chunks(LEAVES_IN_BLOCK)).map_init(Scratch::default, decode);
+    tree.leaves.blocks = blocks.collect::<Result<_>>()?;
+    Ok(())
 }
 
 /// Moves the cursor behind a grid's leaf values without decoding them, as a file without offsets

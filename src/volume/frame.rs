@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{BRICK_DIM, Brick, Coord, CoordBox};
+use super::{BRICK_DIM, Blocks, Brick, Coord, CoordBox};
 
 /// A region of one value.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
@@ -99,7 +99,7 @@ pub struct FrameStats {
 impl FlatFrame {
     /// The smallest corner of each of its bricks.
     pub fn brick_origins(&self) -> Vec<Coord> {
-        let mut origins = Vec::with_capacity(self.bricks.len());
+        let mut origins = Vec::new();
         for cell in &self.cells {
             let CellContent::Node(children) = &cell.content else { continue };
             let bricks = children.iter().filter(|(_, child)| matches!(child, Child::Brick(_)));
@@ -121,7 +121,7 @@ pub struct FlatFrame {
     /// The cells that are not all background, ascending by origin.
     pub cells: Vec<Cell>,
     /// The bricks that the cells name, in the order in which they name them.
-    pub bricks: Vec<Brick>,
+    pub bricks: Blocks<Brick>,
     /// The source's counts.
     pub stats: FrameStats,
 }

@@ -2,6 +2,7 @@
 //!
 //! This room knows nothing of OpenVDB files, codecs or packs.
 
+mod blocks;
 mod brick;
 mod coord;
 mod frame;
@@ -11,6 +12,7 @@ mod pool;
 mod scratch;
 mod sparse;
 
+pub use blocks::Blocks;
 pub use brick::{BRICK_VOXELS, Brick, InactiveRule};
 pub use coord::{BRICK_DIM, CELL_DIM, Coord, CoordBox, ROOT_DIM};
 pub use frame::{Cell, CellContent, Child, Constant, FlatFrame, FrameStats, ValueRange};

@@ -15,8 +15,8 @@ use rayon::prelude::*;
 
 use crate::error::Error;
 use crate::volume::{
-    Brick, BrickPool, CellContent, Child, Constant, Coord, FrameStats, InactiveRule, Interner, List, Mask512,
-    Sparse, ValueRange, bits,
+    Blocks, Brick, BrickPool, CellContent, Child, Constant, Coord, FrameStats, InactiveRule, Interner, List,
+    Mask512, Sparse, ValueRange, bits,
 };
 
 pub use nodes::{Node, Nodes};
@@ -50,7 +50,7 @@ pub struct SequenceTree {
 }
 
 /// Reads the bricks of the frame at a place anew.
-pub type Fetch = dyn Fn(usize) -> io::Result<Vec<Brick>> + Send + Sync;
+pub type Fetch = dyn Fn(usize) -> io::Result<Blocks<Brick>> + Send + Sync;
 
 /// One frame of a [`SequenceTree`].
 pub struct FrameTree {
@@ -183,7 +183,7 @@ impl SequenceTree {
     ///
     /// # Errors
     /// [`DedupError`].
-    pub fn add(&mut self, outline: Outline, voxels: Option<Vec<Brick>>) -> Result<(), DedupError> {
+    pub fn add(&mut self, outline: Outline, voxels: Option<Blocks<Brick>>) -> Result<(), DedupError> {
         self.check_background(&outline)?;
         let first = self.pool.len();
         let mut cells = Vec::with_capacity(outline.cells.len());
@@ -217,22 +217,22 @@ impl SequenceTree {
     }
 
     /// Puts the voxels of a frame's own bricks into the pool.
-    fn put_voxels(&mut self, frame: usize, voxels: &[Brick]) -> io::Result<()> {
+    fn put_voxels(&mut self, frame: usize, voxels: &Blocks<Brick>) -> io::Result<()> {
         for id in self.own_bricks[frame].clone() {
             if !self.pool.is_there(id) {
-                self.pool.put(id, &voxels[self.pool.place(id) as usize].values)?;
+                self.pool.put(id, &voxels[self.pool.place(id)].values)?;
             }
         }
         Ok(())
     }
 
     /// The same for voxels that were fetched for an outline from elsewhere: they must be those that it tells of.
-    fn put_fetched(&mut self, frame: usize, voxels: &[Brick]) -> io::Result<()> {
+    fn put_fetched(&mut self, frame: usize, voxels: &Blocks<Brick>) -> io::Result<()> {
         let own: Vec<u32> = self.own_bricks[frame].clone().collect();
         let digests = self.pool.digests(&own)?;
         let pool = &self.pool;
         let is_told = |(&id, digest): (&u32, &[u8; 32])| {
-            voxels.get(pool.place(id) as usize).is_some_and(|brick| {
+            voxels.get(pool.place(id)).is_some_and(|brick| {
                 let brick = Brick { keeps_mask: pool.keeps_mask(id), ..brick.clone() };
                 BrickPool::digest(&brick) == *digest
             })

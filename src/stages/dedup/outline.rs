@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::cache::pods;
 use crate::stages::flatten::Flattened;
 use crate::volume::{
-    Brick, BrickPool, CELL_DIM, Cell, CellContent, Child, Constant, Coord, FlatFrame, FrameStats,
+    Blocks, Brick, BrickPool, CELL_DIM, Cell, CellContent, Child, Constant, Coord, FlatFrame, FrameStats,
     InactiveRule, Mask512, ROOT_DIM, ValueRange,
 };
 
@@ -76,9 +76,11 @@ pub enum Values {
 
 impl Outline {
     /// Takes the voxels away from a frame: gives them apart, each brick with whether it keeps its mask.
-    pub fn split(flat: Flattened, policy: MaskPolicy) -> (Self, Vec<Brick>) {
+    pub fn split(flat: Flattened, policy: MaskPolicy) -> (Self, Blocks<Brick>) {
         let Flattened { frame: FlatFrame { roots, cells, bricks: mut voxels, stats }, background } = flat;
-        let outlined = voxels.par_iter_mut().map(|b| BrickOutline::new(b, background, policy));
+        let blocks = voxels.blocks_mut().par_iter_mut();
+        let outlined =
+            blocks.flat_map_iter(|b| b.iter_mut().map(|b| BrickOutline::new(b, background, policy)));
         let (mut bricks, signs): (Vec<BrickOutline>, Vec<Option<Mask512>>) = outlined.unzip();
         let mut minus = Vec::new();
         for (brick, signs) in bricks.iter_mut().zip(signs) {
