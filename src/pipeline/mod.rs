@@ -71,8 +71,8 @@ impl Job {
     }
 }
 
-/// Hears how a build is getting on, of what it cares for. Called from one thread at a time.
-pub trait Progress {
+/// Hears how a build is getting on, of what it cares for. Called from one thread at a time, not always the same.
+pub trait Progress: Send {
     /// A stage begins, which has that many steps of that kind.
     fn stage(&mut self, _name: &'static str, _steps: u64, _unit: &'static str) {}
     /// That many more steps of the stage are done.
@@ -243,18 +243,22 @@ fn run_stages(
     let mut grids = frames::read(&plan.sequence, &plan.selection, &job.settings, cache, alter, progress)?;
     clock.lap("flatten and dedup");
     let caches = frames::caches(&plan.sequence, &plan.selection, &job.settings, cache);
-    allocation::allocate(&mut grids, &job.settings, caches, progress)?;
-    // Written while slabs are encoded.
-    save(&mut grids)?;
-    clock.lap("allocate");
-    let bricks: u64 = grids.iter().map(|g| u64::from(g.tree.pool.len())).sum();
-    progress.stage("encode", bricks, "bricks");
-    let level = (job.settings.zstd != 0).then_some(job.settings.zstd);
-    let finished =
-        serialise(&job.output, &mut grids, &plan.provenance, level, |bricks| progress.advance(bricks))
-            .map_err(|e| serialise_error(e, &grids, &job.output))?;
-    save(&mut grids)?;
-    Ok(finished)
+    // On a thread of the pool, since what follows goes to the pool some hundred times: from outside each time means to be
+    // put to sleep and woken.
+    rayon::scope(|_| {
+        allocation::allocate(&mut grids, &job.settings, caches, progress)?;
+        // Written while slabs are encoded.
+        save(&mut grids)?;
+        clock.lap("allocate");
+        let bricks: u64 = grids.iter().map(|g| u64::from(g.tree.pool.len())).sum();
+        progress.stage("encode", bricks, "bricks");
+        let level = (job.settings.zstd != 0).then_some(job.settings.zstd);
+        let finished =
+            serialise(&job.output, &mut grids, &plan.provenance, level, |bricks| progress.advance(bricks))
+                .map_err(|e| serialise_error(e, &grids, &job.output))?;
+        save(&mut grids)?;
+        Ok(finished)
+    })
 }
 
 /// Keeps what was made of bricks.
