@@ -482,7 +482,7 @@ fn forged(case: &Case, built: &Built, from: &str, to: &str) -> Vec<String> {
     reseal(&mut bytes);
     let pack = Pack::from_bytes(bytes).unwrap();
     pack.check_chunks().unwrap();
-    voxels(&pack, &Sources::find(&pack, &case.frames).unwrap(), |_| {}).unwrap().failures
+    voxels(&pack, &Sources::find(&pack, &case.frames).unwrap(), 2, |_| {}).unwrap().failures
 }
 
 #[test]

@@ -132,6 +132,47 @@ fn the_same_input_gives_the_same_bytes() {
 }
 
 #[test]
+fn memory_is_limited_without_a_byte_changing_and_too_little_is_told_before_a_voxel_is_read() {
+    let folder = tempfile::tempdir().unwrap();
+    let build = |name: &str, memory: &[&str]| {
+        let base = ["build", &animation_glob(), "-o", name, "--verify", "voxels", "--threads", "2"];
+        let output = volpack(folder.path(), &[&base, memory].concat());
+        (output, std::fs::read(folder.path().join(name)).ok())
+    };
+    let (_, free) = build("free.volpack", &[]);
+    assert!(free.is_some());
+    // Enough for one frame at a time, and for all that are ever read together.
+    for memory in ["22MiB", "1GB"] {
+        let (output, limited) = build("limited.volpack", &["--memory", memory]);
+        assert!(output.status.success() && limited == free, "{memory}: {output:?}");
+    }
+    let (output, none) = build("none.volpack", &["--memory", "20MiB"]);
+    let (code, error) = failure(&output);
+    assert_eq!(code, 2, "{error}");
+    assert!(error.contains("--memory 20.00 MiB: ") && error.contains("anim_000"), "{error}");
+    let enough = error.split("give it ").nth(1).and_then(|rest| rest.split(" MiB").next()).unwrap();
+    assert!((20.0..22.0).contains(&enough.parse::<f64>().unwrap()), "{error}");
+    assert_eq!(none, None);
+}
+
+#[test]
+fn scratch_lies_in_the_cache_unless_it_is_sent_elsewhere() {
+    let folder = tempfile::tempdir().unwrap();
+    let build = |args: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_volpack"));
+        command.args(["build", &fix("tiles.vdb"), "-o", "out.volpack", "--verify", "none"]).args(args);
+        // Where there is nothing: nobody may look for the system's folder.
+        command.env("TMPDIR", folder.path().join("nowhere")).current_dir(folder.path()).output().unwrap()
+    };
+    let (code, error) = failure(&build(&["--no-cache"]));
+    assert!(code == 3 && error.contains("nowhere"), "{code} {error}");
+    stdout(&build(&["--cache", "cache"]));
+    stdout(&build(&["--no-cache", "--scratch", "scratch"]));
+    let left = std::fs::read_dir(folder.path().join("scratch")).unwrap().count();
+    assert_eq!(left, 0, "scratch files have no name");
+}
+
+#[test]
 fn errors_say_what_to_do_and_exit_by_kind() {
     let folder = tempfile::tempdir().unwrap();
     let at = folder.path();

@@ -51,7 +51,7 @@ impl Victim {
         };
         pack.check_chunks().expect("the digests are right");
         let sources = Sources::find(&pack, std::slice::from_ref(&self.source)).unwrap();
-        let report = voxels(&pack, &sources, |_| {}).unwrap();
+        let report = voxels(&pack, &sources, 1, |_| {}).unwrap();
         report.failures.first().cloned()
     }
 

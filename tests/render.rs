@@ -252,7 +252,7 @@ fn a_large_node_s_neighbours_are_seen_brick_by_brick() {
         let node = (0..256).map(|place| (place, Child::Constant(constant(sign(place))))).collect();
         let cell = |x, content| Cell { origin: Coord::new(x, 0, 0), content };
         frame.roots.clear();
-        frame.bricks.clear();
+        frame.bricks = Vec::new().into();
         frame.cells = vec![cell(0, CellContent::Constant(constant(1.0))), cell(128, CellContent::Node(node))];
         frame.stats.bbox = CoordBox { min: Coord::new(0, 0, 0), max: Coord::new(135, 127, 127) };
         frame.stats.active_range = Some(ValueRange { min: -1.0, max: 1.0 });

@@ -96,6 +96,12 @@ impl Cache {
         self.store.root()
     }
 
+    /// Where builds may put what does not fit in memory: beside what they keep, which is on a disk wherever the system's own
+    /// folder for temporary files may be in memory.
+    pub fn scratch_folder(&self) -> PathBuf {
+        self.store.aside()
+    }
+
     /// What a stage gave for some inputs, if it is known.
     pub fn get<T: DeserializeOwned>(&self, key: &Key) -> Option<T> {
         let found = self.peek(key);

@@ -144,6 +144,11 @@ impl Store {
         &self.root
     }
 
+    /// Where files are written before they are renamed.
+    pub fn aside(&self) -> PathBuf {
+        self.root.join(ASIDE)
+    }
+
     pub fn path(&self, map: Map, digest: &[u8; 32]) -> PathBuf {
         self.place(map.folder(), &blake3::Hash::from(*digest))
     }
@@ -241,7 +246,7 @@ impl Store {
             return Ok(());
         }
         fs::create_dir_all(path.parent().unwrap_or(&self.root))?;
-        let mut file = tempfile::NamedTempFile::new_in(self.root.join(ASIDE))?;
+        let mut file = tempfile::NamedTempFile::new_in(self.aside())?;
         fill(file.as_file_mut())?;
         file.as_file().sync_all()?;
         // Others may share the store.

@@ -7,12 +7,13 @@ use std::sync::Arc;
 use clap::Args;
 
 use super::cache::{CacheChoice, RemoteArgs};
-use super::{SettingsArgs, VerifyArg};
+use super::{MemoryArg, SettingsArgs, VerifyArg};
 use crate::cache::Cache;
 use crate::error::{Error, Result};
 use crate::manifest::{Asset, DEFAULT_NAME, Manifest, expand};
-use crate::pipeline::{Job, VerifyLevel};
+use crate::pipeline::{Job, Resources, VerifyLevel};
 use crate::settings::Budget;
+use crate::volume::ScratchFolder;
 
 #[derive(Args)]
 pub struct JobArgs {
@@ -39,12 +40,29 @@ pub struct JobArgs {
     cache: CacheChoice,
     #[command(flatten)]
     remote: RemoteArgs,
+    #[command(flatten)]
+    memory: MemoryArg,
+    /// Where what does not fit in memory is meanwhile [default: in the cache, else the system's folder for temporary
+    /// files]
+    #[arg(long, value_name = "DIR", env = "VOLPACK_SCRATCH")]
+    scratch: Option<PathBuf>,
 }
 
 impl JobArgs {
     /// The cache that is asked for.
     pub fn open_cache(&self) -> Option<Arc<Cache>> {
         self.cache.open_with(&self.remote)
+    }
+
+    fn scratch_folder(&self, cache: Option<&Arc<Cache>>) -> Result<ScratchFolder> {
+        match (&self.scratch, cache) {
+            (Some(folder), _) => {
+                std::fs::create_dir_all(folder).map_err(Error::io(folder))?;
+                Ok(ScratchFolder::asked_for(folder.clone()))
+            }
+            (None, Some(cache)) => Ok(ScratchFolder::preferred(cache.scratch_folder())),
+            (None, None) => Ok(ScratchFolder::default()),
+        }
     }
 
     /// What all assets together may cost, and what each that is asked for has to keep, by name.
@@ -63,6 +81,7 @@ impl JobArgs {
         cache: Option<&Arc<Cache>>,
         verify: VerifyLevel,
     ) -> Result<Vec<(String, Result<Job>)>> {
+        let scratch = self.scratch_folder(cache)?;
         let job = |frames, output: &Path, settings, max_flip| Job {
             frames,
             output: output.to_owned(),
@@ -72,6 +91,7 @@ impl JobArgs {
             pictures: self.verify.pictures.settings(max_flip),
             cache: cache.cloned(),
             paranoid: self.cache.paranoid,
+            resources: Resources { memory: self.memory.bytes(), scratch: scratch.clone() },
         };
         if !self.frames.is_empty() {
             let output = self

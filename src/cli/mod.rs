@@ -22,7 +22,8 @@ use crate::error::{Error, Result};
 use crate::pipeline::VerifyLevel;
 use crate::render::Device;
 use crate::settings::{
-    ClusterArgs, DEFAULT_ZSTD, Format, Masks, NonFinite, QualityArgs, RangeMode, Settings, above_zero,
+    ByteSize, ClusterArgs, DEFAULT_ZSTD, Format, Masks, NonFinite, QualityArgs, RangeMode, Settings,
+    above_zero,
 };
 use crate::verify::PictureSettings;
 
@@ -113,6 +114,20 @@ struct SettingsArgs {
     /// Frames per second, for engines that play the pack
     #[arg(long, value_name = "RATE", value_parser = positive)]
     fps: Option<f32>,
+}
+
+/// How much memory work may take.
+#[derive(Args)]
+struct MemoryArg {
+    /// The most memory to take, without that of a Vulkan driver: fewer frames are read at a time
+    #[arg(long, value_name = "SIZE")]
+    memory: Option<ByteSize>,
+}
+
+impl MemoryArg {
+    fn bytes(&self) -> Option<u64> {
+        self.memory.map(|size| size.0)
+    }
 }
 
 fn positive(text: &str) -> std::result::Result<f32, String> {

@@ -15,7 +15,7 @@ use crate::cache::Cache;
 use crate::error::{Error, Result};
 use crate::manifest::{DEFAULT_NAME, expand};
 use crate::pack::Pack;
-use crate::pipeline::{Job, Outcome, VerifyLevel, build, check_structure, verify_against};
+use crate::pipeline::{Job, Outcome, Resources, VerifyLevel, build, check_structure, verify_against};
 use crate::report::model::{AssetReport, Figures, Report};
 use crate::report::{
     Baseline, Breach, Gallery, PackSummary, Reported, gallery, html, junit, markdown, schema,
@@ -215,8 +215,9 @@ impl Gathering<'_> {
         let mut reporter = Reporter::new(name, self.common.quiet);
         let files = (!sources.is_empty()).then_some(sources);
         let pictures = PictureSettings::default();
-        let found =
-            files.map(|files| verify_against(&pack, files, Some(&pictures), &mut reporter)).transpose();
+        let found = files
+            .map(|files| verify_against(&pack, files, Some(&pictures), &Resources::default(), &mut reporter))
+            .transpose();
         reporter.finish();
         let found = found?;
         if let Some(report) = found.as_ref().filter(|report| !report.ok) {

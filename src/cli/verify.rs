@@ -7,10 +7,10 @@ use serde_json::json;
 
 use super::progress::Reporter;
 use super::style::{ERROR, GOOD, TITLE};
-use super::{Common, PictureArgs, outln, print_json};
+use super::{Common, MemoryArg, PictureArgs, outln, print_json};
 use crate::error::{Error, Result};
 use crate::manifest::{DEFAULT_NAME, Manifest, expand};
-use crate::pipeline::{check_structure, verify_against};
+use crate::pipeline::{Resources, check_structure, verify_against};
 use crate::units::psnr;
 use crate::verify::{PicturesReport, VerifyReport};
 
@@ -29,6 +29,8 @@ pub struct VerifyArgs {
     level: Level,
     #[command(flatten)]
     pictures: PictureArgs,
+    #[command(flatten)]
+    memory: MemoryArg,
     /// Print JSON
     #[arg(long)]
     json: bool,
@@ -59,7 +61,8 @@ pub fn run(args: &VerifyArgs, common: Common) -> Result<()> {
     let settings = args.pictures.settings(max_flip);
     let mut reporter = Reporter::new("verify", common.quiet || args.json);
     let pictures = (args.level == Level::All).then_some(&settings);
-    let report = verify_against(&pack, &sources, pictures, &mut reporter);
+    let resources = Resources { memory: args.memory.bytes(), ..Resources::default() };
+    let report = verify_against(&pack, &sources, pictures, &resources, &mut reporter);
     reporter.finish();
     let report = report?;
     if args.json {

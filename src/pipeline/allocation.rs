@@ -33,7 +33,7 @@ pub(super) fn allocate(
                     Some(clustering) => {
                         progress.stage("cluster", grid.tree.pool.len().into(), "bricks");
                         allocate::clustered(&mut grid.tree, encodings, codec, settings.range, clustering)
-                            .map_err(|e| allocate_error(e, &grid.name))?
+                            .map_err(|e| allocate_error(e, grid))?
                     }
                 });
             }
@@ -63,7 +63,7 @@ fn adaptive(
     });
     let allocations =
         allocate::adaptive(candidates.collect(), &target, &mut |bricks| progress.advance(bricks));
-    let allocations = allocations.map_err(|e| allocate_error(e, &grids[0].name))?;
+    let allocations = allocations.map_err(|e| allocate_error(e, &grids[0]))?;
     grids.iter_mut().zip(allocations).for_each(|(grid, allocation)| grid.allocation = Some(allocation));
     check_size(grids, settings.quality)
 }
@@ -114,9 +114,9 @@ fn check_size(grids: &[GridInput], quality: Quality) -> Result<()> {
     }
 }
 
-fn allocate_error(error: AllocateError, grid: &str) -> Error {
+fn allocate_error(error: AllocateError, grid: &GridInput) -> Error {
     match error {
-        AllocateError::Io(source) => Error::io(std::env::temp_dir())(source),
-        AllocateError::OutOfRange(source) => Error::OutOfRange { grid: grid.to_owned(), source },
+        AllocateError::Io(source) => Error::io(grid.tree.scratch.path())(source),
+        AllocateError::OutOfRange(source) => Error::OutOfRange { grid: grid.name.clone(), source },
     }
 }

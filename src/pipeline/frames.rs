@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
-use super::Progress;
+use super::{Job, Plan, Progress, memory};
 use crate::cache::{Cache, Key, Stage};
 use crate::error::{Error, Result};
 use crate::settings::{Format, Masks, Settings};
@@ -26,25 +26,32 @@ const OUTLINE: Stage = Stage { name: "outline", version: 2, travels: false };
 /// One grid of one frame, with its voxels unless they were not needed so far.
 type Frame = (Outline, Option<Blocks<Brick>>);
 
-/// Reads frames, as many at a time as there are threads, and adds them in order: twice as many are in memory.
+/// Reads frames and adds them in order: while some are added the next are read, as many as there are threads.
 pub(super) fn read(
-    sequence: &SequenceInfo,
-    selection: &Selection,
-    settings: &Settings,
+    job: &Job,
+    plan: &Plan,
     cache: Option<&Arc<Cache>>,
     alter: Option<Alter>,
     progress: &mut dyn Progress,
 ) -> Result<Vec<GridInput>> {
+    let (Plan { sequence, selection, .. }, settings) = (plan, &job.settings);
+    let at_once = memory::frames_at_once(plan, &job.resources)?;
+    let window_frames = (at_once / 2).max(1);
     let mut grids: Vec<GridInput> = Vec::new();
     for grid in &selection.grids {
-        let fetch = cache.is_some().then(|| fetch(sequence, grid, settings));
-        grids.push(grid_input(sequence, grid, SequenceTree::new(fetch), settings));
+        let fetch = cache.is_some().then(|| fetch(sequence, grid, settings, window_frames));
+        grids.push(grid_input(
+            sequence,
+            grid,
+            SequenceTree::new(job.resources.scratch.clone(), fetch),
+            settings,
+        ));
     }
     let read = |window: &[FrameSource]| -> Vec<Result<Vec<Option<Frame>>>> {
         let read = |frame: &FrameSource| read_frame(frame, selection, settings, cache.map(|c| &**c), alter);
         window.par_iter().map(read).collect()
     };
-    let mut windows = sequence.frames.chunks(rayon::current_num_threads());
+    let mut windows = sequence.frames.chunks(window_frames);
     let mut window = windows.next().unwrap_or_default();
     let mut frames = read(window);
     while !window.is_empty() {
@@ -53,15 +60,21 @@ pub(super) fn read(
         // The next frames are read while these are added: on this thread, so that what stays does not lie between what
         // comes and goes with a frame, which would keep the allocator from using it anew.
         let mut later = Vec::new();
-        let added = rayon::in_place_scope(|scope| {
-            scope.spawn(|_| later = read(next));
-            add(&mut grids, window, frames)
-        });
-        added?;
+        if at_once > 1 {
+            rayon::in_place_scope(|scope| {
+                scope.spawn(|_| later = read(next));
+                add(&mut grids, window, frames)
+            })?;
+        } else {
+            add(&mut grids, window, frames)?;
+            later = read(next);
+        }
         progress.advance(window.len() as u64);
         (window, frames) = (next, later);
     }
-    grids.iter_mut().try_for_each(|grid| grid.tree.seal()).map_err(scratch)?;
+    for grid in &mut grids {
+        grid.tree.seal().map_err(Error::io(grid.tree.scratch.path()))?;
+    }
     Ok(grids)
 }
 
@@ -76,7 +89,7 @@ fn add(
         for (grid, frame) in grids.iter_mut().zip(frame?) {
             let Some((outline, voxels)) = frame else { continue };
             grid.tree.add(outline, voxels).map_err(|e| match e {
-                DedupError::Scratch { source } => scratch(source),
+                DedupError::Scratch { source } => Error::io(grid.tree.scratch.path())(source),
                 DedupError::Background { .. } => Error::Input(format!(
                     "{}: grid {:?}: {e}: export the whole sequence with one background",
                     source.path.display(),
@@ -86,10 +99,6 @@ fn add(
         }
     }
     Ok(())
-}
-
-fn scratch(error: std::io::Error) -> Error {
-    Error::io(std::env::temp_dir())(error)
 }
 
 /// The selected grids of one file; `None` for those that it does not have.
@@ -146,16 +155,17 @@ fn flatten_grid(
 }
 
 /// Reads the voxels of a grid's frames once more, for those whose outline alone is known.
-fn fetch(sequence: &SequenceInfo, grid: &SelectedGrid, settings: &Settings) -> Box<Fetch> {
+fn fetch(sequence: &SequenceInfo, grid: &SelectedGrid, settings: &Settings, at_once: usize) -> Fetch {
     let frames: Vec<FrameSource> = grid.frames.iter().map(|&i| sequence.frames[i].clone()).collect();
     let (grid, settings) = (grid.clone(), settings.clone());
-    Box::new(move |place| {
+    let read = move |place: usize| {
         let frame = &frames[place];
         let file = VdbFile::open(&frame.path).map_err(Error::vdb(&frame.path))?;
         let flat = flatten_grid(&file, frame, &grid, &settings)?;
         frame.check_unchanged()?;
         Ok(flat.frame.bricks)
-    })
+    };
+    Fetch { read: Box::new(read), at_once }
 }
 
 /// What the outline of one grid of one frame depends on; `None` if the frame lacks the grid.

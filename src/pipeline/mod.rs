@@ -3,6 +3,7 @@
 mod allocation;
 mod explain;
 mod frames;
+mod memory;
 mod reuse;
 
 use std::collections::BTreeMap;
@@ -24,6 +25,7 @@ use crate::stages::quantise::QuantiseError;
 use crate::stages::select::{Selection, select};
 use crate::stages::serialise::{GridInput, SerialiseError, serialise};
 use crate::verify::{self, PictureSettings, Sources, VerifyReport};
+use crate::volume::ScratchFolder;
 pub use explain::{Explanation, StagePlan, explain};
 use frames::Alter;
 use reuse::{Reuse, Reused};
@@ -61,13 +63,35 @@ pub struct Job {
     pub cache: Option<Arc<Cache>>,
     /// Whether sources that seem unchanged are hashed all the same.
     pub paranoid: bool,
+    /// What of the machine it may take.
+    pub resources: Resources,
+}
+
+/// What a build may take of a machine. It changes no byte of the pack.
+#[derive(Clone, Debug, Default)]
+pub struct Resources {
+    /// The most bytes of memory; as many frames as keep all threads busy where nothing is said.
+    pub memory: Option<u64>,
+    /// Where what does not fit in memory is meanwhile.
+    pub scratch: ScratchFolder,
 }
 
 impl Job {
     /// A build whose warnings are warnings, with the usual pictures, from the ground up.
     pub fn new(frames: Vec<PathBuf>, output: PathBuf, settings: Settings, verify: VerifyLevel) -> Self {
         let pictures = PictureSettings::default();
-        Self { frames, output, settings, strict: false, verify, pictures, cache: None, paranoid: false }
+        let resources = Resources::default();
+        Self {
+            frames,
+            output,
+            settings,
+            strict: false,
+            verify,
+            pictures,
+            cache: None,
+            paranoid: false,
+            resources,
+        }
     }
 }
 
@@ -240,7 +264,7 @@ fn run_stages(
     progress: &mut dyn Progress,
 ) -> Result<FinishedPack> {
     progress.stage("flatten", plan.sequence.frames.len() as u64, "frames");
-    let mut grids = frames::read(&plan.sequence, &plan.selection, &job.settings, cache, alter, progress)?;
+    let mut grids = frames::read(job, plan, cache, alter, progress)?;
     clock.lap("flatten and dedup");
     let caches = frames::caches(&plan.sequence, &plan.selection, &job.settings, cache);
     // On a thread of the pool, since what follows goes to the pool some hundred times: from outside each time means to be
@@ -265,7 +289,7 @@ fn run_stages(
 fn save(grids: &mut [GridInput]) -> Result<()> {
     for grid in grids {
         if let Some(allocation) = &mut grid.allocation {
-            allocation.encodings.save(&grid.tree).map_err(Error::io(std::env::temp_dir()))?;
+            allocation.encodings.save(&grid.tree).map_err(Error::io(grid.tree.scratch.path()))?;
         }
     }
     Ok(())
@@ -281,7 +305,7 @@ fn verified(job: &Job, path: &Path, progress: &mut dyn Progress) -> Result<(Pack
         return Ok((pack, None));
     }
     let pictures = (job.verify == VerifyLevel::All).then_some(&job.pictures);
-    let report = verify_against(&pack, &job.frames, pictures, progress)?;
+    let report = verify_against(&pack, &job.frames, pictures, &job.resources, progress)?;
     Ok((pack, Some(report)))
 }
 
@@ -316,11 +340,13 @@ pub fn verify_against(
     pack: &Pack,
     files: &[PathBuf],
     pictures: Option<&PictureSettings>,
+    resources: &Resources,
     progress: &mut dyn Progress,
 ) -> Result<VerifyReport> {
     progress.stage("verify", files.len() as u64, "frames");
     let sources = Sources::find(pack, files)?;
-    let mut report = verify::voxels(pack, &sources, |frames| progress.advance(frames))?;
+    let at_once = memory::compared_at_once(pack, files, resources)?;
+    let mut report = verify::voxels(pack, &sources, at_once, |frames| progress.advance(frames))?;
     if let Some(settings) = pictures {
         report.add_pictures(verify::pictures(pack, &sources, settings)?);
     }

@@ -9,9 +9,9 @@ use std::sync::Mutex;
 
 use super::cursor::Cursor;
 use super::grid::{Descriptor, GridInfo, read_metadata};
-use super::tree::Tree;
+use super::tree::{Tree, TreeSize};
 use super::tree_read::{read_leaves, read_topology, skip_leaves};
-use super::value::{Value, ValueType, with_value_type};
+use super::value::{Value, ValueType, with_scalar_type, with_value_type};
 use super::{Result, VdbError};
 
 /// `OPENVDB_MAGIC` as a little-endian 64-bit word.
@@ -75,12 +75,25 @@ impl VdbFile {
         Ok(Self { version, library, metadata, grids, source })
     }
 
+    /// How large a grid's tree is, without reading its voxels. It must be of scalars.
+    ///
+    /// # Errors
+    /// As [`VdbFile::read_topology`].
+    pub fn tree_size(&self, grid: &GridInfo) -> Result<TreeSize> {
+        with_scalar_type!(&grid.value_type,
+            T => Ok(TreeSize::of(&self.read_topology::<T>(grid)?, self.owner(grid).tree.clone())),
+            other => Err(VdbError::Unsupported(format!("the voxels of {} grids are not read", other.name())))
+        )
+    }
+
     /// Reads a grid's masks and tiles, but not its leaves' values.
     ///
     /// # Errors
     /// [`VdbError::Grid`] around what is wrong.
     pub fn read_topology<T: Value>(&self, grid: &GridInfo) -> Result<Tree<T>> {
-        self.with_tree(grid, read_topology)
+        let owner = self.owner(grid);
+        let read = self.source.parse_in(owner.tree.clone(), |c| read_topology(c, owner));
+        Ok(read.map_err(|e| e.in_grid(&grid.name))?.0)
     }
 
     /// Reads a grid's whole tree. `T` must be its value type. The leaves are decoded on the current
@@ -89,23 +102,22 @@ impl VdbFile {
     /// # Errors
     /// [`VdbError::Grid`] around what is wrong.
     pub fn read_tree<T: Value>(&self, grid: &GridInfo) -> Result<Tree<T>> {
-        self.with_tree(grid, |c, owner| {
-            let mut tree = read_topology(c, owner)?;
-            read_leaves(c, owner, &mut tree)?;
+        let owner = self.owner(grid);
+        let read = |bytes: &[u8]| {
+            let mut c = Cursor::new(bytes, owner.tree.start);
+            let mut tree = read_topology(&mut c, owner)?;
+            read_leaves(&mut c, owner, &mut tree)?;
             Ok(tree)
-        })
-    }
-
-    fn with_tree<R>(
-        &self,
-        grid: &GridInfo,
-        read: impl FnOnce(&mut Cursor, &GridInfo) -> Result<R>,
-    ) -> Result<R> {
-        let owner = grid.instance_of.map_or(grid, |i| &self.grids[i]);
+        };
         self.source
             .range(owner.tree.clone())
-            .and_then(|bytes| read(&mut Cursor::new(&bytes, owner.tree.start), owner))
+            .and_then(|bytes| read(&bytes))
             .map_err(|e| e.in_grid(&grid.name))
+    }
+
+    /// The grid whose tree a grid has: itself, or the one that it is an instance of.
+    fn owner<'a>(&'a self, grid: &'a GridInfo) -> &'a GridInfo {
+        grid.instance_of.map_or(grid, |i| &self.grids[i])
     }
 }
 
@@ -228,7 +240,12 @@ impl Source {
 
     /// Parses at byte `at` with as much of the file as that takes, and says where it ended.
     fn parse<R>(&self, at: u64, parse: impl Fn(&mut Cursor) -> Result<R>) -> Result<(R, u64)> {
-        let left = self.len().saturating_sub(at);
+        self.parse_in(at..self.len(), parse)
+    }
+
+    /// The same with no more than a part of the file.
+    fn parse_in<R>(&self, part: Range<u64>, parse: impl Fn(&mut Cursor) -> Result<R>) -> Result<(R, u64)> {
+        let (at, left) = (part.start, part.end.saturating_sub(part.start));
         let mut window = WINDOW.min(left);
         loop {
             let bytes = self.range(at..at + window)?;

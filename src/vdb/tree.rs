@@ -1,6 +1,7 @@
 //! A grid's tree as OpenVDB has it: a root over 32³ nodes over 16³ nodes over 8³ leaves.
 
 use std::collections::HashMap;
+use std::ops::Range;
 
 use crate::volume::{BRICK_DIM, BRICK_VOXELS, CELL_DIM, Coord, Mask512, ROOT_DIM};
 
@@ -19,6 +20,27 @@ pub struct Tree<T> {
     pub l2: Vec<Internal<T>>,
     /// 8³ voxel leaves.
     pub leaves: Leaves<T>,
+}
+
+/// What a tree takes.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct TreeSize {
+    /// How many leaves it has.
+    pub leaves: u64,
+    /// Bytes of memory while it is read, those of its part of the file among them.
+    pub bytes: u64,
+}
+
+impl TreeSize {
+    pub(super) fn of<T>(tree: &Tree<T>, in_file: Range<u64>) -> Self {
+        let leaves = tree.leaves.len() as u64;
+        let value = size_of::<T>() as u64;
+        // A value and two bits for each child.
+        let children = tree.l1.iter().chain(&tree.l2).map(|node| node.tiles.len() as u64).sum::<u64>();
+        let nodes = children * value + children / 4;
+        let leaf = size_of::<Coord>() as u64 + size_of::<Mask512>() as u64 + BRICK_VOXELS as u64 * value;
+        Self { leaves, bytes: in_file.end - in_file.start + nodes + leaves * leaf }
+    }
 }
 
 /// A constant 4096³ region.

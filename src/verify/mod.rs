@@ -47,19 +47,23 @@ impl Sources {
     }
 }
 
-/// Compares every voxel of every frame with the pack's sources. `advance` hears of each source file
-/// that is done.
+/// Compares every voxel of every frame with the pack's sources, so many of them at a time. `advance` hears of each source
+/// file that is done.
 ///
 /// # Errors
 /// When a source is unreadable, or a chunk of the pack is damaged. Differences are no error: they are in
 /// the report.
-pub fn voxels(pack: &Pack, sources: &Sources, mut advance: impl FnMut(u64)) -> Result<VerifyReport> {
+pub fn voxels(
+    pack: &Pack,
+    sources: &Sources,
+    at_once: usize,
+    mut advance: impl FnMut(u64),
+) -> Result<VerifyReport> {
     let paths = &sources.0;
     let mut errors: Vec<Vec<Option<FrameError>>> =
         pack.grids.iter().map(|g| g.frames.iter().map(|_| None).collect()).collect();
     let places: Vec<usize> = (0..paths.len()).collect();
-    // As many frames in memory as there are threads.
-    for window in places.chunks(rayon::current_num_threads()) {
+    for window in places.chunks(at_once) {
         crate::interrupt::check()?;
         let results: Vec<_> =
             window.par_iter().map(|&source| compare_source(pack, source, &paths[source])).collect();

@@ -21,7 +21,7 @@ static WEIGHTS: [[f32; 8]; 256] = {
     let mut all = [[0.0; 8]; 256];
     let mut i = 0;
     while i < 256 * 8 {
-        all[i / 8][i % 8] = (i / 8 >> (i % 8) & 1) as f32;
+        all[i / 8][i % 8] = (((i / 8) >> (i % 8)) & 1) as f32;
         i += 1;
     }
     all

@@ -7,7 +7,7 @@ use bytemuck::{Pod, Zeroable};
 use hashbrown::HashTable;
 use xxhash_rust::xxh3::{xxh3_64, xxh3_128};
 
-use super::{BRICK_VOXELS, Brick, List, Mask512, SCRATCH_SMALL, Scratch};
+use super::{BRICK_VOXELS, Brick, List, Mask512, SCRATCH_SMALL, Scratch, ScratchFolder};
 
 /// Bricks that are worked on before what was made of them is put away: enough batches of an encoder for every core.
 pub const BRICKS_IN_FLIGHT: u32 = 4096;
@@ -66,19 +66,18 @@ fn hash(active: &Mask512) -> u64 {
     xxh3_64(bytemuck::bytes_of(active))
 }
 
-impl Default for BrickPool {
-    fn default() -> Self {
+impl BrickPool {
+    /// No bricks yet, whose scratch files will be in a folder.
+    pub fn new(scratch: &ScratchFolder) -> Self {
         Self {
             by_digest: HashTable::new(),
             starts: List::default(),
             bricks: List::default(),
-            facts: Scratch::new(size_of::<Facts>(), SCRATCH_SMALL),
-            values: Scratch::new(BRICK_VOXELS * 4, 0),
+            facts: Scratch::new(scratch, size_of::<Facts>(), SCRATCH_SMALL),
+            values: Scratch::new(scratch, BRICK_VOXELS * 4, 0),
         }
     }
-}
 
-impl BrickPool {
     /// How many unique bricks there are.
     pub fn len(&self) -> u32 {
         self.bricks.len() as u32

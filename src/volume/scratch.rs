@@ -2,6 +2,8 @@
 
 use std::fs::File;
 use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use bytemuck::Pod;
 
@@ -16,8 +18,45 @@ const GAP: u64 = 16 << 10;
 /// second.
 pub const SCRATCH_SMALL: usize = 256 << 10;
 
+/// Where scratch files are made. They have no name, so that a process that is killed leaves none.
+#[derive(Clone, Debug)]
+pub struct ScratchFolder {
+    folder: Arc<Path>,
+    is_asked_for: bool,
+}
+
+impl Default for ScratchFolder {
+    /// The system's folder for temporary files.
+    fn default() -> Self {
+        Self::asked_for(std::env::temp_dir())
+    }
+}
+
+impl ScratchFolder {
+    /// This one and no other.
+    pub fn asked_for(folder: PathBuf) -> Self {
+        Self { folder: folder.into(), is_asked_for: true }
+    }
+
+    /// This one, or the system's where nothing can be written to it.
+    pub fn preferred(folder: PathBuf) -> Self {
+        Self { folder: folder.into(), is_asked_for: false }
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.folder
+    }
+
+    fn file(&self) -> io::Result<File> {
+        let file = tempfile::tempfile_in(&self.folder);
+        if self.is_asked_for { file } else { file.or_else(|_| tempfile::tempfile()) }
+    }
+}
+
 /// Records by their places, which may be filled in any order; one after another is the quickest.
 pub struct Scratch {
+    folder: ScratchFolder,
     record: usize,
     store: Store,
     /// Bytes that may be in memory.
@@ -37,8 +76,15 @@ enum Store {
 impl Scratch {
     /// None yet, of that many bytes each. Until there are more than `small` bytes they stay in memory: a short sequence
     /// then needs no file for what is small.
-    pub fn new(record: usize, small: usize) -> Self {
-        Self { record, store: Store::Memory(Vec::new()), small, buffer: Vec::new(), buffered: 0 }
+    pub fn new(folder: &ScratchFolder, record: usize, small: usize) -> Self {
+        Self {
+            folder: folder.clone(),
+            record,
+            store: Store::Memory(Vec::new()),
+            small,
+            buffer: Vec::new(),
+            buffered: 0,
+        }
     }
 
     /// Bytes of each.
@@ -96,7 +142,7 @@ impl Scratch {
                 all[at as usize..end].copy_from_slice(bytes);
                 return Ok(());
             }
-            let file = tempfile::tempfile()?;
+            let file = self.folder.file()?;
             write_at(&file, all, 0)?;
             self.store = Store::File(file);
         }
@@ -234,7 +280,7 @@ mod tests {
     #[test]
     fn records_come_back_in_the_order_asked_for() {
         for small in [0, 100_000, 1 << 20] {
-            records_come_back(Scratch::new(8, small));
+            records_come_back(Scratch::new(&ScratchFolder::default(), 8, small));
         }
     }
 

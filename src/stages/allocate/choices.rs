@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::rung::Rung;
 use super::share::Loan;
 use crate::stages::encodings::{Cost, Encodings, KeptCodec, Kind};
-use crate::volume::{SCRATCH_SMALL, Scratch};
+use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder};
 
 /// An L3 record is three words.
 pub(super) const RECORD_BITS: u32 = 96;
@@ -128,8 +128,8 @@ pub(super) struct Table {
 
 impl Table {
     /// Of no brick yet.
-    pub fn new(peak: f64) -> Self {
-        let choices = Scratch::new(size_of::<Choices>(), SCRATCH_SMALL);
+    pub fn new(scratch: &ScratchFolder, peak: f64) -> Self {
+        let choices = Scratch::new(scratch, size_of::<Choices>(), SCRATCH_SMALL);
         let texel_bits = Rung::ALL.map(|rung| rung.texel_bits().into());
         Self { peak, texel_bits, bricks: 0, choices, loans: HashMap::new(), has_loan: Vec::new() }
     }

@@ -24,7 +24,7 @@ pub fn clustered(
     mode: RangeMode,
     clustering: &Clustering,
 ) -> Result<Allocation, AllocateError> {
-    let mut allocation = Allocation::new(encodings);
+    let mut allocation = Allocation::new(&tree.scratch, encodings);
     let sequence = allocation.sequence;
     let (mut ids, mut points) = (Vec::new(), Vec::new());
     for window in windows(tree.pool.len(), BRICKS_IN_FLIGHT) {

@@ -19,7 +19,7 @@ use half::f16;
 use super::dedup::SequenceTree;
 use super::encodings::Encodings;
 use crate::codec::{BrickRange, Codec, OutOfRange, SequenceRange};
-use crate::volume::{SCRATCH_SMALL, Scratch, Sparse, ValueRange};
+use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder, Sparse, ValueRange};
 
 pub use adaptive::{AdaptiveGrid, Target, adaptive};
 pub use cluster::clustered;
@@ -99,8 +99,8 @@ pub enum AllocateError {
 
 impl Norms {
     /// None yet.
-    fn new() -> Self {
-        Self { norms: Scratch::new(size_of::<f64>(), SCRATCH_SMALL), are_known: false }
+    fn new(scratch: &ScratchFolder) -> Self {
+        Self { norms: Scratch::new(scratch, size_of::<f64>(), SCRATCH_SMALL), are_known: false }
     }
 
     /// Notes those of bricks, one after another.
@@ -129,14 +129,14 @@ impl Norms {
 }
 
 impl Allocation {
-    fn new(encodings: Encodings) -> Self {
+    fn new(scratch: &ScratchFolder, encodings: Encodings) -> Self {
         Self {
             sequence: encodings.sequence,
             kinds: Vec::new(),
             words: Sparse::default(),
             shapes: Vec::new(),
             borrowed: Sparse::default(),
-            norms: Norms::new(),
+            norms: Norms::new(scratch),
             empty_squares: Vec::new(),
             encodings,
         }
@@ -211,7 +211,7 @@ fn windows(bricks: u32, size: u32) -> impl Iterator<Item = Vec<u32>> {
 
 /// Gives every brick of `tree` one codec.
 pub fn uniform(tree: &SequenceTree, encodings: Encodings, codec: Codec) -> Allocation {
-    let mut allocation = Allocation::new(encodings);
+    let mut allocation = Allocation::new(&tree.scratch, encodings);
     (0..tree.pool.len()).for_each(|_| allocation.push(Coding::Own(codec), None));
     allocation
 }

@@ -80,7 +80,7 @@ impl<'a> GridSearch<'a> {
             lends: vec![None; uses.len()],
             active_voxels: tree.frames.iter().map(|f| f.stats.active_leaf_voxels).sum(),
             voxel_size: grid.voxel_size,
-            table: Table::new(peak),
+            table: Table::new(&tree.scratch, peak),
             encodings: grid.encodings,
             tree,
         };
@@ -389,7 +389,7 @@ impl<'a> GridSearch<'a> {
     pub(super) fn finish(self, picks: &[Rung]) -> io::Result<Allocation> {
         let Self { tree, encodings, bc7_is_tried, table, .. } = self;
         let loans = table.into_loans();
-        let mut allocation = Allocation::new(encodings);
+        let mut allocation = Allocation::new(&tree.scratch, encodings);
         for ids in windows(picks.len() as u32, BLOCK) {
             let mut norms = Vec::with_capacity(ids.len());
             for (&id, (costs, value)) in ids.iter().zip(costs(&allocation.encodings, &ids, &bc7_is_tried)?) {

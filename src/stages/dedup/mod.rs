@@ -16,7 +16,7 @@ use rayon::prelude::*;
 use crate::error::Error;
 use crate::volume::{
     Blocks, Brick, BrickPool, CellContent, Child, Constant, Coord, FrameStats, InactiveRule, Interner, List,
-    Mask512, Sparse, ValueRange, bits,
+    Mask512, ScratchFolder, Sparse, ValueRange, bits,
 };
 
 pub use nodes::{Node, Nodes};
@@ -42,15 +42,25 @@ pub struct SequenceTree {
     pub brick_ranges: List<ValueRange>,
     /// For each frame, the bricks of the pool that it had first.
     pub own_bricks: Vec<Range<u32>>,
+    /// Where what does not fit in memory is.
+    pub scratch: ScratchFolder,
     /// Gives the voxels of a frame that was added without.
-    fetch: Option<Box<Fetch>>,
+    fetch: Option<Fetch>,
     /// Of bricks that are no entries by themselves.
     record_of_brick: Sparse<u32>,
     record_of_constant: HashMap<(u32, Option<u32>, InactiveRule), u32>,
 }
 
-/// Reads the bricks of the frame at a place anew.
-pub type Fetch = dyn Fn(usize) -> io::Result<Blocks<Brick>> + Send + Sync;
+/// Reads the bricks of a frame.
+pub type Read = dyn Fn(usize) -> io::Result<Blocks<Brick>> + Send + Sync;
+
+/// The way to a frame's voxels.
+pub struct Fetch {
+    /// Reads those of the frame at a place.
+    pub read: Box<Read>,
+    /// Frames that may be read at a time.
+    pub at_once: usize,
+}
 
 /// One frame of a [`SequenceTree`].
 pub struct FrameTree {
@@ -118,7 +128,7 @@ pub enum Payload {
 #[derive(Debug, thiserror::Error)]
 pub enum DedupError {
     /// The scratch file failed.
-    #[error("the scratch file in {}: {source}", std::env::temp_dir().display())]
+    #[error("a scratch file: {source}")]
     Scratch {
         /// Why.
         #[from]
@@ -147,19 +157,20 @@ impl SequenceTree {
         }
     }
 
-    /// An empty sequence. `fetch` gives the voxels of frames that are added without; it is not needed where all have
-    /// theirs.
-    pub fn new(fetch: Option<Box<Fetch>>) -> Self {
+    /// An empty sequence, with scratch files in a folder. `fetch` gives the voxels of frames that are added without; it is
+    /// not needed where all have theirs.
+    pub fn new(scratch: ScratchFolder, fetch: Option<Fetch>) -> Self {
         Self {
             background: 0.0,
             frames: Vec::new(),
-            nodes: Nodes::default(),
+            nodes: Nodes::new(&scratch),
             runs: Interner::default(),
             records: List::default(),
             masks: Interner::default(),
-            pool: BrickPool::default(),
+            pool: BrickPool::new(&scratch),
             brick_ranges: List::default(),
             own_bricks: Vec::new(),
+            scratch,
             fetch,
             record_of_brick: Sparse::default(),
             record_of_constant: HashMap::new(),
@@ -251,10 +262,13 @@ impl SequenceTree {
         let frame = |id: &u32| self.own_bricks.partition_point(|own| own.end <= *id);
         let absent: BTreeSet<usize> = ids.iter().filter(|&&id| !self.pool.is_there(id)).map(frame).collect();
         let absent: Vec<usize> = absent.into_iter().collect();
-        for frames in absent.chunks(rayon::current_num_threads()) {
-            let fetch =
-                self.fetch.as_ref().expect("frames without voxels are added with a way to fetch them");
-            let fetched: Vec<_> = frames.par_iter().map(|&frame| fetch(frame)).collect();
+        if absent.is_empty() {
+            return self.pool.flush();
+        }
+        const WAY: &str = "frames without voxels are added with a way to fetch them";
+        for frames in absent.chunks(self.fetch.as_ref().expect(WAY).at_once) {
+            let read = &self.fetch.as_ref().expect(WAY).read;
+            let fetched: Vec<_> = frames.par_iter().map(|&frame| read(frame)).collect();
             for (&frame, voxels) in frames.iter().zip(fetched) {
                 self.put_fetched(frame, &voxels?)?;
             }
@@ -353,7 +367,8 @@ impl SequenceTree {
     /// # Errors
     /// When the scratch file fails.
     pub fn prune(&mut self, is_empty: impl Fn(u32) -> bool) -> io::Result<()> {
-        let (nodes, runs) = (std::mem::take(&mut self.nodes), std::mem::take(&mut self.runs));
+        let nodes = std::mem::replace(&mut self.nodes, Nodes::new(&self.scratch));
+        let runs = std::mem::take(&mut self.runs);
         let mut moved: Vec<Option<u32>> = Vec::with_capacity(nodes.all().len());
         let mut run = Vec::new();
         nodes.visit(|node, children| {

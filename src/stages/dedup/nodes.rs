@@ -6,7 +6,7 @@ use std::io;
 use bytemuck::{Pod, Zeroable};
 use xxhash_rust::xxh3::xxh3_128;
 
-use crate::volume::{Interner, SCRATCH_SMALL, Scratch};
+use crate::volume::{Interner, SCRATCH_SMALL, Scratch, ScratchFolder};
 
 /// Which of a node's 4096 children exist: one bit a child, x slowest.
 pub type Children = [u64; 64];
@@ -35,14 +35,13 @@ pub struct Nodes {
     children: Scratch,
 }
 
-impl Default for Nodes {
-    fn default() -> Self {
-        let children = Scratch::new(size_of::<Children>(), SCRATCH_SMALL);
+impl Nodes {
+    /// None yet, whose scratch file will be in a folder.
+    pub fn new(scratch: &ScratchFolder) -> Self {
+        let children = Scratch::new(scratch, size_of::<Children>(), SCRATCH_SMALL);
         Self { by_hash: HashMap::new(), nodes: Vec::new(), children }
     }
-}
 
-impl Nodes {
     /// The number of the node with these children, whose entries begin at `run`.
     ///
     /// # Errors

@@ -221,7 +221,9 @@ impl Encodings {
                 let (next, mut later) = (groups.next(), Ok(Vec::new()));
                 rayon::in_place_scope(|scope| {
                     let later = &mut later;
-                    next.map(|next| scope.spawn(move |_| *later = read(next)));
+                    if let Some(next) = next {
+                        scope.spawn(move |_| *later = read(next));
+                    }
                     found?.into_iter().flatten().try_for_each(|Found { kind, ids, made }| {
                         kept[kind.index()].add(rules.len(), &ids, &made)
                     })

@@ -5,7 +5,7 @@ use std::io;
 use bytemuck::{Pod, Zeroable};
 
 use super::{Cost, KeptCodec, Kind, Made};
-use crate::volume::{SCRATCH_SMALL, Scratch};
+use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder};
 
 /// A [`Cost`], and something more of what it is the cost of.
 #[derive(Clone, Copy, Pod, Zeroable)]
@@ -93,11 +93,11 @@ impl Places {
 
 impl Kept {
     /// Nothing yet of a kind.
-    pub fn new(kind: Kind) -> Self {
+    pub fn new(scratch: &ScratchFolder, kind: Kind) -> Self {
         Self {
             places: Places::new(kind),
-            notes: Scratch::new(kind.notes() * size_of::<Note>(), SCRATCH_SMALL),
-            texels: (kind.texels() > 0).then(|| Scratch::new(kind.texels(), 0)),
+            notes: Scratch::new(scratch, kind.notes() * size_of::<Note>(), SCRATCH_SMALL),
+            texels: (kind.texels() > 0).then(|| Scratch::new(scratch, kind.texels(), 0)),
         }
     }
 

@@ -191,7 +191,7 @@ impl Encodings {
         let batches = Batches::new(tree, cache, &sequence, &terms);
         Some(Self {
             rules: tree.brick_rules(),
-            kept: Kind::ALL.map(Kept::new),
+            kept: Kind::ALL.map(|kind| Kept::new(&tree.scratch, kind)),
             batches,
             saved: Instant::now(),
             sequence,
