@@ -19,7 +19,7 @@ use crate::volume::{BRICK_VOXELS, Brick};
 /// 14 MiB with 2 threads. A Vulkan driver's memory is not in it.
 const PROGRAM: u64 = 12 << 20;
 const OF_A_THREAD: u64 = 4 << 20;
-/// What is kept of each leaf of a sequence while it is built. Measured: 60 (docs/decisions/0012-scale.md).
+/// What is kept of each leaf of a sequence while it is built. Measured: 75 (docs/decisions/0012-scale.md).
 const OF_A_LEAF: u64 = 96;
 /// What there is of a leaf of a frame beside its values: its part of an outline, or what a comparison found.
 const BESIDE_VALUES: u64 = 512;
