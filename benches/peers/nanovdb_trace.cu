@@ -1,4 +1,4 @@
-// Traces a NanoVDB grid of floats with NanoVDB's own HDDA and accessor, along the rays that volpack traces.
+// Traces a NanoVDB grid of floats, or of FpN, with NanoVDB's own HDDA and accessor, along the rays that volpack traces.
 //
 //     nanovdb_trace GRID.nvdb fog|nearest|trilinear WIDTH HEIGHT REPEATS PICTURE < rays
 //
@@ -20,9 +20,10 @@
 #include <vector>
 
 using nanovdb::Coord;
-using Grid = nanovdb::NanoGrid<float>;
-using Accessor = nanovdb::DefaultReadAccessor<float>;
-using Leaf = nanovdb::NanoLeaf<float>;
+template <typename Build>
+using Grid = nanovdb::NanoGrid<Build>;
+template <typename Build>
+using Accessor = nanovdb::DefaultReadAccessor<Build>;
 using Ray = nanovdb::Ray<float>;
 using Vec = nanovdb::Vec3<float>;
 
@@ -50,7 +51,8 @@ __device__ Ray ray_of(const View& view, int x, int y)
 }
 
 // The integral of density: every voxel on the ray, with the length of the ray in it.
-__device__ float fog(const Grid& grid, Ray ray)
+template <typename Build>
+__device__ float fog(const Grid<Build>& grid, Ray ray)
 {
     auto accessor = grid.tree().getAccessor();
     if (!ray.clip(accessor.root().bbox()))
@@ -72,7 +74,8 @@ __device__ float fog(const Grid& grid, Ray ray)
 
 // Where NanoVDB's own function sees the sign change. (Any arithmetic on t here makes nvcc 13's code for
 // it 1.6 times slower: units are the caller's business.)
-__device__ float nearest(const Grid& grid, Ray ray)
+template <typename Build>
+__device__ float nearest(const Grid<Build>& grid, Ray ray)
 {
     auto accessor = grid.tree().getAccessor();
     Coord ijk;
@@ -81,14 +84,15 @@ __device__ float nearest(const Grid& grid, Ray ray)
 }
 
 // The eight voxels from ijk on, ordered by x + 2y + 4z: straight from a leaf that holds them all.
-__device__ void corners(Accessor& accessor, const Coord& ijk, float* v)
+template <typename Build>
+__device__ void corners(Accessor<Build>& accessor, const Coord& ijk, float* v)
 {
-    const Leaf* leaf = accessor.probeLeaf(ijk);
+    const auto* leaf = accessor.probeLeaf(ijk);
     if (leaf && (ijk[0] & 7) < 7 && (ijk[1] & 7) < 7 && (ijk[2] & 7) < 7) {
-        const float* first = leaf->data()->mValues + Leaf::CoordToOffset(ijk);
+        const auto first = nanovdb::NanoLeaf<Build>::CoordToOffset(ijk);
 #pragma unroll
         for (int i = 0; i < 8; i++)
-            v[i] = first[(i & 1) * 64 + (i >> 1 & 1) * 8 + (i >> 2)];
+            v[i] = leaf->data()->getValue(first + (i & 1) * 64 + (i >> 1 & 1) * 8 + (i >> 2));
     } else {
 #pragma unroll
         for (int i = 0; i < 8; i++)
@@ -150,7 +154,8 @@ struct Cubic
 
 // The first zero of the trilinear interpolant. As in any narrow band, cells with a zero begin at an active
 // voxel. Halving comes after all steps, with the whole warp: that halves the time.
-__device__ float trilinear(const Grid& grid, Ray ray)
+template <typename Build>
+__device__ float trilinear(const Grid<Build>& grid, Ray ray)
 {
     auto accessor = grid.tree().getAccessor();
     if (!ray.clip(accessor.root().bbox()))
@@ -168,7 +173,7 @@ __device__ float trilinear(const Grid& grid, Ray ray)
             do {
                 ijk = hdda.voxel();
                 float v[8];
-                corners(accessor, ijk, v);
+                corners<Build>(accessor, ijk, v);
                 bool mixed = false;
 #pragma unroll
                 for (int i = 0; i < 8; i++)
@@ -196,13 +201,23 @@ __device__ float trilinear(const Grid& grid, Ray ray)
     return start + length * high;
 }
 
-template <float TRACE(const Grid&, Ray)>
-__global__ void trace(const Grid* grid, View view, float* picture)
+template <typename Build, float TRACE(const Grid<Build>&, Ray)>
+__global__ void trace(const void* grid, View view, float* picture)
 {
     const int x = blockIdx.x * blockDim.x + threadIdx.x, y = blockIdx.y * blockDim.y + threadIdx.y;
     if (x >= view.width || y >= view.height)
         return;
-    picture[y * view.width + x] = TRACE(*grid, ray_of(view, x, y));
+    picture[y * view.width + x] = TRACE(*static_cast<const Grid<Build>*>(grid), ray_of(view, x, y));
+}
+
+using Kernel = void (*)(const void*, View, float*);
+
+template <typename Build>
+Kernel kernel_of(const std::string& shows)
+{
+    return shows == "fog" ? trace<Build, fog<Build>>
+        : shows == "nearest" ? trace<Build, nearest<Build>>
+                             : trace<Build, trilinear<Build>>;
 }
 
 int main(int count, char** arguments)
@@ -214,14 +229,14 @@ int main(int count, char** arguments)
         if (!(std::cin >> (*vector)[0] >> (*vector)[1] >> (*vector)[2]))
             return 2;
     const std::string shows = arguments[2];
-    const auto kernel = shows == "fog" ? trace<fog> : shows == "nearest" ? trace<nearest> : trace<trilinear>;
     view.width = std::atoi(arguments[3]);
     view.height = std::atoi(arguments[4]);
     const int repeats = std::atoi(arguments[5]);
 
     auto handle = nanovdb::io::readGrid(arguments[1]);
-    if (!handle.grid<float>())
+    if (!handle.grid<float>() && !handle.grid<nanovdb::FpN>())
         return 2;
+    const Kernel kernel = handle.grid<float>() ? kernel_of<float>(shows) : kernel_of<nanovdb::FpN>(shows);
     void* grid;
     float* pixels;
     std::vector<float> picture(size_t(view.width) * view.height);
@@ -238,7 +253,7 @@ int main(int count, char** arguments)
     const dim3 blocks((view.width + 7) / 8, (view.height + block.y - 1) / block.y);
     for (int i = 0; i < repeats; i++) {
         check(cudaEventRecord(start));
-        kernel<<<blocks, block>>>(static_cast<Grid*>(grid), view, pixels);
+        kernel<<<blocks, block>>>(grid, view, pixels);
         check(cudaEventRecord(end));
         check(cudaEventSynchronize(end));
         float milliseconds;

@@ -59,12 +59,12 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     let mut rows = Vec::new();
     println!("{} at {width} × {height}, median of {} frames\n", gpu.name, args.repeats);
     println!(
-        "| volume | shows | format | HDDA ms | NanoVDB ms | HDDA / NanoVDB | apart | DDA ms | DDA / HDDA | HDDA steps | DDA steps |"
+        "| volume | shows | format | HDDA ms | NanoVDB float ms | HDDA / float | FpN ms | HDDA / FpN | apart | DDA ms | DDA / HDDA | HDDA steps | DDA steps |"
     );
-    println!("|---|---|---|---|---|---|---|---|---|---|---|");
+    println!("|---|---|---|---|---|---|---|---|---|---|---|---|---|");
     for path in &args.files {
         let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        let mut theirs: Vec<(&str, Theirs)> = Vec::new();
+        let mut theirs: Vec<(&str, &str, Theirs)> = Vec::new();
         let mut camera = None;
         let mut lines = Vec::new();
         for format in Format::ALL {
@@ -85,18 +85,25 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 let camera = *camera.get_or_insert(scene.camera);
                 let scene = Scene { camera, interpolation, ..scene };
                 if let (Format::F32, Ok(peer)) = (format, &peer) {
-                    let traced =
-                        nanovdb_trace(peer, path, &grid.name, shows, &scene, args.repeats, folder.path())?;
-                    theirs.push((shows, traced));
+                    // What the converter itself allows: a tenth of a voxel, or 0.01 in fog.
+                    let absolute =
+                        if scene.level_set { 0.1 * volpack::vdb::voxel_size(&scene.matrix) } else { 0.01 };
+                    for (kind, quantise) in [(FLOAT, Quantise::Float), (FPN, Quantise::FpN { absolute })] {
+                        let source = (path.as_path(), grid.name.as_str(), quantise);
+                        let traced = nanovdb_trace(peer, source, shows, &scene, args.repeats, folder.path())?;
+                        theirs.push((shows, kind, traced));
+                    }
                 }
-                let theirs = theirs.iter().find(|(shown, _)| *shown == shows).map(|(_, theirs)| theirs);
+                let theirs = |kind| {
+                    theirs.iter().find(|their| (their.0, their.1) == (shows, kind)).map(|their| &their.2)
+                };
                 let mut row = Vec::new();
                 let mut apart = None;
                 for traversal in [Traversal::Hdda, Traversal::Dda] {
                     let scene = Scene { traversal, ..scene };
                     let repeats = args.repeats + WARM_UP;
                     let (image, ms) = gpu.trace_timed(&uploaded, [0, 0], bounds, &scene, repeats)?;
-                    apart = apart.or_else(|| theirs.map(|t| t.apart(&image, &scene)));
+                    apart = apart.or_else(|| theirs(FLOAT).map(|t| t.apart(&image, &scene)));
                     let ms = ms.get(WARM_UP as usize..).unwrap_or_default();
                     row.push((median(ms.iter().copied()), image.mean_steps()));
                     rows.push(json!({ "volume": name, "shows": shows, "format": format,
@@ -106,12 +113,13 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 let [(hdda, hdda_steps), (dda, dda_steps)] = row[..] else {
                     return Err("two traversals".into());
                 };
-                let beside = match (theirs, apart) {
-                    (Some(t), Some(apart)) => {
-                        let theirs = median(t.milliseconds.iter().copied());
-                        format!("{theirs:.3} | {:.2} | {apart:.1e}", hdda / theirs)
+                let beside = match (theirs(FLOAT), theirs(FPN), apart) {
+                    (Some(float), Some(fpn), Some(apart)) => {
+                        let [float, fpn] = [float, fpn].map(|t| median(t.milliseconds.iter().copied()));
+                        let [of_float, of_fpn] = [hdda / float, hdda / fpn];
+                        format!("{float:.3} | {of_float:.2} | {fpn:.3} | {of_fpn:.2} | {apart:.1e}")
                     }
-                    _ => " | | ".to_owned(),
+                    _ => " | | | | ".to_owned(),
                 };
                 lines.push((shows, format!(
                     "| {name} | {shows} | {} | {hdda:.3} | {beside} | {dda:.3} | {:.2} | {hdda_steps:.1} | {dda_steps:.1} |",
@@ -122,8 +130,8 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
         }
         lines.sort_by_key(|(shows, _)| std::cmp::Reverse(*shows));
         lines.iter().for_each(|(_, line)| println!("{line}"));
-        rows.extend(theirs.iter().map(|(shows, theirs)| {
-            json!({ "volume": name, "shows": shows, "format": "NanoVDB float", "milliseconds": theirs.milliseconds })
+        rows.extend(theirs.iter().map(|(shows, kind, theirs)| {
+            json!({ "volume": name, "shows": shows, "format": kind, "milliseconds": theirs.milliseconds })
         }));
     }
     if let Some(path) = &args.json {
@@ -131,6 +139,10 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     }
     Ok(())
 }
+
+/// NanoVDB's grids.
+const FLOAT: &str = "NanoVDB float";
+const FPN: &str = "NanoVDB FpN";
 
 /// What NanoVDB makes of a scene.
 struct Theirs {
@@ -141,18 +153,17 @@ struct Theirs {
     picture: Vec<f32>,
 }
 
-/// Traces a float grid of `vdb` with the peer's program.
+/// Traces a grid of a file, quantised, with the peer's program.
 fn nanovdb_trace(
     peer: &Path,
-    vdb: &Path,
-    grid: &str,
+    (vdb, grid, quantise): (&Path, &str, Quantise),
     shows: &str,
     scene: &Scene,
     repeats: u32,
     folder: &Path,
 ) -> Result<Theirs, Box<dyn Error>> {
     let (nvdb, out) = (folder.join("peer.nvdb"), folder.join("peer.f32"));
-    nanovdb::convert(vdb, grid, &Quantise::Float, &nvdb)?;
+    nanovdb::convert(vdb, grid, &quantise, &nvdb)?;
     // To NanoVDB's steps a voxel is the cube from its coordinate on, half a voxel off from index space; between
     // voxels a cell is.
     let shift = if shows == "trilinear" { 0.0 } else { 0.5 };
