@@ -26,7 +26,8 @@ const OUTLINE: Stage = Stage { name: "outline", version: 2, travels: false };
 /// One grid of one frame, with its voxels unless they were not needed so far.
 type Frame = (Outline, Option<Blocks<Brick>>);
 
-/// Reads frames and adds them in order: while some are added the next are read, as many as there are threads.
+/// Reads frames and adds them in order: while some are added the next are read, as many as memory
+/// has room for.
 pub(super) fn read(
     job: &Job,
     plan: &Plan,

@@ -39,7 +39,7 @@ pub struct Args {
 }
 
 /// What `nanovdb_convert --fpN` takes for fog where no tolerance is given.
-const TOLERANCE: f64 = 0.01;
+pub const TOLERANCE: f64 = 0.01;
 
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     let folder = tempfile::tempdir()?;

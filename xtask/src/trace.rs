@@ -14,6 +14,7 @@ use volpack::render::{Image, Interpolation, Lens, Mode, Scene, Traversal, View};
 use volpack::settings::{Format, Settings};
 use volpack::sweep::nanovdb::{self, Quantise};
 
+use crate::beside::TOLERANCE;
 use crate::measured::median;
 use crate::peers;
 
@@ -85,9 +86,12 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 let camera = *camera.get_or_insert(scene.camera);
                 let scene = Scene { camera, interpolation, ..scene };
                 if let (Format::F32, Ok(peer)) = (format, &peer) {
-                    // What the converter itself allows: a tenth of a voxel, or 0.01 in fog.
-                    let absolute =
-                        if scene.level_set { 0.1 * volpack::vdb::voxel_size(&scene.matrix) } else { 0.01 };
+                    // What the converter itself allows: a tenth of a voxel where there is a level set.
+                    let absolute = if scene.level_set {
+                        0.1 * volpack::vdb::voxel_size(&scene.matrix)
+                    } else {
+                        TOLERANCE
+                    };
                     for (kind, quantise) in [(FLOAT, Quantise::Float), (FPN, Quantise::FpN { absolute })] {
                         let source = (path.as_path(), grid.name.as_str(), quantise);
                         let traced = nanovdb_trace(peer, source, shows, &scene, args.repeats, folder.path())?;

@@ -262,13 +262,11 @@ impl SequenceTree {
         let frame = |id: &u32| self.own_bricks.partition_point(|own| own.end <= *id);
         let absent: BTreeSet<usize> = ids.iter().filter(|&&id| !self.pool.is_there(id)).map(frame).collect();
         let absent: Vec<usize> = absent.into_iter().collect();
-        if absent.is_empty() {
-            return self.pool.flush();
-        }
-        const WAY: &str = "frames without voxels are added with a way to fetch them";
-        for frames in absent.chunks(self.fetch.as_ref().expect(WAY).at_once) {
-            let read = &self.fetch.as_ref().expect(WAY).read;
-            let fetched: Vec<_> = frames.par_iter().map(|&frame| read(frame)).collect();
+        let at_once = self.fetch.as_ref().map_or(1, |fetch| fetch.at_once);
+        for frames in absent.chunks(at_once) {
+            let fetch =
+                self.fetch.as_ref().expect("frames without voxels are added with a way to fetch them");
+            let fetched: Vec<_> = frames.par_iter().map(|&frame| (fetch.read)(frame)).collect();
             for (&frame, voxels) in frames.iter().zip(fetched) {
                 self.put_fetched(frame, &voxels?)?;
             }
