@@ -1,7 +1,7 @@
 //! Reads one frame back: from coordinates to regions, from L3 records to voxels.
 
 use std::borrow::Cow;
-use std::collections::{HashMap, HashSet};
+use std::collections::HashMap;
 
 use super::tree::{self, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS, header, l1_words};
 use super::{Atlas, Frame, Grid, Pack, PackError};
@@ -65,27 +65,6 @@ impl Pack {
     /// What a GPU has to hold: tree, masks and texture pages.
     pub fn gpu_bytes(&self) -> u64 {
         self.tree.len() as u64 * 4 + self.atlases.iter().map(Atlas::bytes).sum::<u64>()
-    }
-
-    /// Whether bricks of different ranges use the texels of a record: they suit neither one exactly.
-    pub fn is_shared(&self, record: &L3Record) -> bool {
-        let shared = self.shared.get_or_init(|| {
-            let words = &self.tree;
-            let records = words[words[header::RECORD_AT] as usize..].as_chunks::<RECORD_WORDS>().0;
-            let mut ranges = HashMap::new();
-            let mut shared = HashSet::new();
-            for words in &records[..words[header::RECORDS] as usize] {
-                let Some(record) = L3Record::from_words(*words) else { continue };
-                let slot = (record.codec, record.slot);
-                if record.codec != Codec::Constant
-                    && *ranges.entry(slot).or_insert(record.word2) != record.word2
-                {
-                    shared.insert(slot);
-                }
-            }
-            shared
-        });
-        shared.contains(&(record.codec, record.slot))
     }
 
     /// One frame's tree without its texels: regions can be found, bricks not decoded.
@@ -280,11 +259,6 @@ impl FrameReader<'_> {
             values[i] = if minus.get(i) { -background } else { background };
         }
         Ok(DecodedBrick { values, active })
-    }
-
-    /// [`Pack::is_shared`].
-    pub fn is_shared(&self, record: &L3Record) -> bool {
-        self.pack.is_shared(record)
     }
 
     /// For each voxel of a record, how far what a GPU reads may be from [`FrameReader::decode`].

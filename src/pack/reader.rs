@@ -1,10 +1,8 @@
 //! Maps a pack and gives its parts, each checked before it is used.
 
 use std::borrow::Cow;
-use std::collections::HashSet;
 use std::fs::File;
 use std::path::Path;
-use std::sync::OnceLock;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use bytemuck::Pod;
@@ -45,8 +43,6 @@ pub struct Pack {
     /// The texel section's place for each of `atlases`.
     texel_sections: Vec<usize>,
     checked: Vec<AtomicBool>,
-    /// Slots of texels that bricks of different ranges use.
-    pub(super) shared: OnceLock<HashSet<(Codec, u32)>>,
 }
 
 enum Bytes {
@@ -133,7 +129,6 @@ impl Pack {
         let (sections, chunks) = read_tables(&bytes)?;
         let mut pack = Self {
             checked: chunks.iter().map(|_| AtomicBool::new(false)).collect(),
-            shared: OnceLock::new(),
             bytes,
             grids: Vec::new(),
             tree: Vec::new(),
