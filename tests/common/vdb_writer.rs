@@ -155,7 +155,7 @@ fn file(version: u32, grids: &[(&str, &str, Vec<u8>)]) -> Vec<u8> {
     }
     // It has offsets.
     out.push(1);
-    out.extend([b'0'; 36]);
+    out.extend(b"00000000-0000-0000-0000-000000000000");
     out.extend(0u32.to_le_bytes());
     out.extend((grids.len() as i32).to_le_bytes());
     for (name, tree_type, body) in grids {
