@@ -81,17 +81,13 @@ pub fn run(args: &RenderArgs, common: Common) -> Result<()> {
     }
 
     let mode = args.mode.unwrap_or(Mode::of_grid(&pack.grids[grid]));
-    // One camera for all frames: around everything that any of them has.
-    let mut bounds = crate::volume::CoordBox::EMPTY;
-    frames.iter().for_each(|&f| bounds.union(pack.frame_tree(grid, f).bounds()));
     let mut pictures = Vec::new();
     let mut steps = 0.0;
     for &frame in &frames {
-        let info = &pack.grids[grid];
         let scene = Scene {
             traversal: args.traversal,
             interpolation: args.interpolation,
-            ..Scene::new(info, &info.frames[frame], bounds, &args.camera, mode, args.size)
+            ..Scene::new(&pack.grids[grid], frame, &args.camera, mode, args.size)
         };
         let image = renderer.render(grid, frame, &scene).map_err(|e| gpu_error(e, &args.pack))?;
         steps += image.mean_steps() / frames.len() as f64;

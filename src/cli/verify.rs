@@ -6,7 +6,7 @@ use clap::{Args, ValueEnum};
 use serde_json::json;
 
 use super::progress::Reporter;
-use super::style::{ERROR, GOOD, TITLE};
+use super::style::{ERROR, GOOD, TITLE, WARNING};
 use super::{Common, MemoryArg, PictureArgs, outln, print_json};
 use crate::error::{Error, Result};
 use crate::manifest::{DEFAULT_NAME, Manifest, expand};
@@ -142,14 +142,20 @@ fn print_pictures(report: &PicturesReport) {
     }
     let worst = report.pictures.iter().max_by(|a, b| a.source.flip.total_cmp(&b.source.flip));
     if let Some(p) = worst {
+        let limit = report.max_flip.map(|limit| format!(", limit {limit:.4}")).unwrap_or_default();
         outln!(
-            "    to the eye   FLIP {:.4} of at most {:.4}, {} (frame {} of {})",
+            "    FLIP         {:.4}{limit}, {} (frame {} of {})",
             p.source.flip,
-            report.max_flip,
             psnr(p.source.psnr),
             p.frame,
             p.grid
         );
+    }
+    for note in &report.not_compared {
+        outln!("    not compared {note}");
+    }
+    for warning in &report.warnings {
+        outln!("  {WARNING}warning{WARNING:#}: {warning}");
     }
 }
 

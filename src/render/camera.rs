@@ -1,7 +1,53 @@
 //! Where pictures are taken from.
 
 use super::traverse::{Ray, Real};
+use crate::pack::Grid;
 use crate::volume::CoordBox;
+
+/// A box in world space, parallel to its axes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct WorldBox {
+    min: [f64; 3],
+    max: [f64; 3],
+}
+
+impl WorldBox {
+    /// The box around boxes of voxels, each under its own index-to-world matrix; of size 0 at the origin where all are
+    /// empty. A voxel is the cube around its index coordinate.
+    pub fn around<'a>(boxes: impl IntoIterator<Item = (CoordBox, &'a [f64; 16])>) -> Self {
+        let (mut min, mut max) = ([f64::INFINITY; 3], [f64::NEG_INFINITY; 3]);
+        for (voxels, matrix) in boxes.into_iter().filter(|(voxels, _)| !voxels.is_empty()) {
+            for corner in 0..8 {
+                let end = |a: usize| match corner >> a & 1 {
+                    0 => f64::from(voxels.min.0[a]) - 0.5,
+                    _ => f64::from(voxels.max.0[a]) + 0.5,
+                };
+                let corner = transform(matrix, std::array::from_fn(end));
+                (min, max) = (
+                    std::array::from_fn(|a| min[a].min(corner[a])),
+                    std::array::from_fn(|a| max[a].max(corner[a])),
+                );
+            }
+        }
+        if min[0] > max[0] { Self { min: [0.0; 3], max: [0.0; 3] } } else { Self { min, max } }
+    }
+
+    /// The box around the active voxels of all frames of a grid's source, as the frame table has them: the same for every
+    /// pack of one source.
+    pub fn of_grid(grid: &Grid) -> Self {
+        let frames = grid.frames.iter().map(|frame| &frame.record);
+        Self::around(frames.map(|record| (CoordBox::from_array(record.bbox), &record.transform)))
+    }
+
+    /// The length of its diagonal, in world units.
+    pub fn diagonal(&self) -> f64 {
+        length(sub(self.max, self.min))
+    }
+
+    fn middle(&self) -> [f64; 3] {
+        std::array::from_fn(|a| f64::midpoint(self.min[a], self.max[a]))
+    }
+}
 
 /// A pinhole camera in world space.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -61,28 +107,18 @@ impl std::str::FromStr for View {
 const FOV: f64 = 45.0;
 
 impl View {
-    /// The length of a box's diagonal in world units.
-    pub fn diagonal(bounds: CoordBox, matrix: &[f64; 16]) -> f64 {
-        let (min, max) = ends(bounds);
-        if bounds.is_empty() { 0.0 } else { length(sub(transform(matrix, max), transform(matrix, min))) }
-    }
-
-    /// The camera for a box of voxels under an index-to-world matrix.
-    pub fn camera(&self, bounds: CoordBox, matrix: &[f64; 16]) -> Camera {
+    /// The camera for a box. Of a box of no size it is a world unit away.
+    pub fn camera(&self, bounds: &WorldBox) -> Camera {
         let [azimuth, elevation, distance] = match *self {
             Self::Fixed(camera) => return camera,
             Self::Orbit(orbit) => orbit,
         };
-        let (min, max) = ends(bounds);
-        let target = transform(matrix, std::array::from_fn(|a| (min[a] + max[a]) / 2.0));
-        let diagonal = Self::diagonal(bounds, matrix);
+        let target = bounds.middle();
+        let diagonal = bounds.diagonal();
+        let distance = distance * if diagonal > 0.0 { diagonal } else { 1.0 };
         let (azimuth, elevation) = (azimuth.to_radians(), elevation.to_radians());
         let direction = [azimuth.sin() * elevation.cos(), elevation.sin(), azimuth.cos() * elevation.cos()];
-        Camera {
-            eye: std::array::from_fn(|a| target[a] + direction[a] * distance * diagonal),
-            target,
-            fov: FOV,
-        }
+        Camera { eye: std::array::from_fn(|a| target[a] + direction[a] * distance), target, fov: FOV }
     }
 }
 
@@ -142,11 +178,6 @@ impl Lens {
     }
 }
 
-/// The two ends of a box's diagonal, in index space.
-fn ends(bounds: CoordBox) -> ([f64; 3], [f64; 3]) {
-    (bounds.min.0.map(f64::from), bounds.max.0.map(|v| f64::from(v) + 1.0))
-}
-
 fn transform(m: &[f64; 16], p: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|c| p[0] * m[c] + p[1] * m[4 + c] + p[2] * m[8 + c] + m[12 + c])
 }
@@ -182,9 +213,10 @@ pub fn length(v: [f64; 3]) -> f64 {
     dot(v, v).sqrt()
 }
 
+/// A vector of length 1, or one of length 0 as it is.
 pub fn normalise(v: [f64; 3]) -> [f64; 3] {
     let l = length(v);
-    v.map(|c| c / l)
+    if l > 0.0 { v.map(|c| c / l) } else { v }
 }
 
 #[cfg(test)]
@@ -205,12 +237,12 @@ mod tests {
     fn the_middle_ray_meets_the_target() {
         // A rotated, sheared and moved grid.
         let m = [0.7, 0.1, -0.7, 0.0, 0.0, 2.0, 0.3, 0.0, 0.7, 0.0, 0.7, 0.0, 5.0, -3.0, 1.0, 1.0];
-        let bounds = CoordBox::cube(crate::volume::Coord::new(-8, 0, 16), 32);
-        let camera = View::default().camera(bounds, &m);
+        let voxels = CoordBox::cube(crate::volume::Coord::new(-8, 0, 16), 32);
+        let camera = View::default().camera(&WorldBox::around([(voxels, &m)]));
         let lens = Lens::new(&camera, &m, [64, 32], [0.0; 3]).unwrap();
         let ray = lens.ray::<f64>(0.0, 0.0);
         let t = length(sub(camera.target, camera.eye));
-        for (a, middle) in [8.0, 16.0, 32.0].into_iter().enumerate() {
+        for (a, middle) in [7.5, 15.5, 31.5].into_iter().enumerate() {
             assert!((ray.origin[a] + ray.direction[a] * t - middle).abs() < 1e-9);
         }
     }

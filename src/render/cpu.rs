@@ -5,13 +5,13 @@
 
 use rayon::prelude::*;
 
-use super::camera::{Camera, Lens, View, apply3, dot, invert3, length, normalise};
+use super::camera::{Camera, Lens, View, WorldBox, apply3, dot, invert3, length, normalise};
 use super::field::{Content, Field};
-use super::image::Image;
+use super::image::{Image, opacity};
 use super::surface::{cubic, evaluate, first_change};
-use super::traverse::{Box3, Ray, Real, Walk};
+use super::traverse::{Box3, MAX_CELL, Ray, Real, Walk};
 use super::{Interpolation, Mode, Traversal};
-use crate::pack::{Frame, Grid};
+use crate::pack::Grid;
 use crate::vdb::GridClass;
 use crate::volume::{Coord, CoordBox, ROOT_DIM};
 
@@ -45,28 +45,26 @@ const BOX_DEPTH: f64 = 24.0;
 const HIT_DENSITY: f32 = 0.05;
 
 impl Scene {
-    /// A picture of a frame of a pack, or of its source. `voxels` is the box of what is not background.
-    pub fn new(
-        grid: &Grid,
-        frame: &Frame,
-        voxels: CoordBox,
-        view: &View,
-        mode: Mode,
-        size: [u32; 2],
-    ) -> Self {
-        let matrix = frame.record.transform;
-        let densest = f64::from(grid.record.active_max);
-        let extent = View::diagonal(voxels, &matrix) * densest;
+    /// A picture of a frame of a pack, or of its source. Camera, extinction and threshold are one for all frames of the
+    /// grid and come from what its tables say of the source, so packs of one source are pictured alike whatever they lost.
+    ///
+    /// # Panics
+    /// When there is no such frame.
+    pub fn new(grid: &Grid, frame: usize, view: &View, mode: Mode, size: [u32; 2]) -> Self {
+        let bounds = WorldBox::of_grid(grid);
+        // What is below 0 absorbs nothing.
+        let densest = grid.record.active_max.max(0.0);
+        let depth = bounds.diagonal() * f64::from(densest);
         Self {
             mode,
             traversal: Traversal::default(),
-            camera: view.camera(voxels, &matrix),
+            camera: view.camera(&bounds),
             size,
-            matrix,
+            matrix: grid.frames[frame].record.transform,
             level_set: grid.record.class == GridClass::LevelSet as u32,
             interpolation: Interpolation::default(),
-            extinction: if extent > 0.0 { BOX_DEPTH / extent } else { 0.0 },
-            threshold: HIT_DENSITY * grid.record.active_max,
+            extinction: if depth > 0.0 { BOX_DEPTH / depth } else { 0.0 },
+            threshold: HIT_DENSITY * densest,
         }
     }
 
@@ -84,6 +82,17 @@ pub const AMBIENT: f64 = 0.15;
 const SHADOW_OFFSET: f64 = 1.5;
 /// Steps after which a ray is given up: more than any box in view has cells across.
 const MAX_STEPS: u32 = 1 << 16;
+
+/// Why a frame cannot be traced.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum TraceError {
+    /// The scene's matrix has no inverse.
+    #[error("the grid's transform cannot be inverted")]
+    Transform,
+    /// The box of what is not background is too wide for the tracers' arithmetic.
+    #[error("its voxels lie in a box {0} voxels wide, and pictures are drawn of at most {MAX_CELL}")]
+    TooWide(i64),
+}
 
 /// What does not depend on the pixel, as both tracers take it. Cells are counted from `base`, so that
 /// an `f32` has as many bits for a volume far from the origin as for one around it.
@@ -103,36 +112,76 @@ pub struct Setup {
 }
 
 impl Setup {
-    /// `voxels` is the box of everything that is not background. `None` if the scene's matrix cannot be
-    /// inverted.
-    pub fn new(scene: &Scene, voxels: CoordBox) -> Option<Self> {
-        let base = if voxels.is_empty() { [0; 3] } else { voxels.min.0 };
-        let size =
-            |a: usize| if voxels.is_empty() { 0 } else { (voxels.max.0[a] - base[a]).saturating_add(1) };
-        let bounds = Box3 { min: [0; 3], max: std::array::from_fn(size) };
+    /// `voxels` is the box of everything that is not background.
+    ///
+    /// # Errors
+    /// [`TraceError`].
+    pub fn new(scene: &Scene, voxels: CoordBox) -> Result<Self, TraceError> {
+        let (base, size) = if voxels.is_empty() {
+            ([0; 3], [0; 3])
+        } else {
+            let size = |a: usize| i64::from(voxels.max.0[a]) - i64::from(voxels.min.0[a]) + 1;
+            (voxels.min.0, std::array::from_fn(size))
+        };
+        if let Some(wide) = size.into_iter().find(|size| *size > i64::from(MAX_CELL)) {
+            return Err(TraceError::TooWide(wide));
+        }
+        let bounds = Box3 { min: [0; 3], max: size.map(|size| size as i32) };
         let bounds = if scene.is_trilinear() { bounds.grown() } else { bounds };
         let shift = if scene.is_trilinear() { 0.0 } else { 0.5 };
         let shift = base.map(|b| shift - f64::from(b));
-        let lens = Lens::new(&scene.camera, &scene.matrix, scene.size, shift)?;
+        let lens = Lens::new(&scene.camera, &scene.matrix, scene.size, shift).ok_or(TraceError::Transform)?;
         // world = index · M, so gradients go by the inverse transposed: row r of it is what index
         // axis a has of world axis r.
-        let inverse = invert3(&scene.matrix)?;
+        let inverse = invert3(&scene.matrix).ok_or(TraceError::Transform)?;
         let sun_world = normalise(SUN);
         let sun = apply3(&inverse, sun_world);
         let sun = sun.map(|v| v * SHADOW_OFFSET / length(sun));
-        Some(Self { base, bounds, lens, sun, normals: inverse, sun_world })
+        Ok(Self { base, bounds, lens, sun, normals: inverse, sun_world })
     }
 }
 
 /// Traces a picture: four numbers a pixel, of which the last is the steps taken.
 ///
-/// `None` if the scene's matrix cannot be inverted.
-pub fn trace<F: Real>(field: &Field, scene: &Scene) -> Option<Image> {
+/// # Errors
+/// [`TraceError`].
+pub fn trace<F: Real>(field: &Field, scene: &Scene) -> Result<Image, TraceError> {
+    Ok(trace_noting_bc4::<F>(field, scene)?.0)
+}
+
+/// The same, and for each pixel whether its rays read a brick of BC4, whose values are each GPU's own.
+///
+/// # Errors
+/// [`TraceError`].
+pub fn trace_noting_bc4<F: Real>(field: &Field, scene: &Scene) -> Result<(Image, Vec<bool>), TraceError> {
     let setup = Setup::new(scene, field.bounds)?;
     let tracer = Tracer::<F> { field, scene, setup: &setup, extinction: F::from_f64(scene.extinction) };
     let [width, height] = scene.size;
-    let pixels = (0..width * height).into_par_iter().map(|i| tracer.pixel(i % width, i / width)).collect();
-    Some(Image { size: scene.size, pixels })
+    let pixels = (0..width * height).into_par_iter().map(|i| tracer.pixel(i % width, i / width));
+    let (pixels, reads_bc4) = pixels.unzip();
+    Ok((Image { size: scene.size, pixels }, reads_bc4))
+}
+
+/// For each pixel the integral of density over distance, which [`Mode::Density`] shows as opacity.
+///
+/// # Errors
+/// [`TraceError`].
+pub fn optical_depths<F: Real>(field: &Field, scene: &Scene) -> Result<Vec<f32>, TraceError> {
+    let setup = Setup::new(scene, field.bounds)?;
+    let tracer = Tracer::<F> { field, scene, setup: &setup, extinction: F::from_i32(1) };
+    let [width, height] = scene.size;
+    let depth = |i| {
+        let ray = tracer.ray(i % width, i / width);
+        tracer.optical_depth(&ray, &mut Visited::default()).to_f64() as f32
+    };
+    Ok((0..width * height).into_par_iter().map(depth).collect())
+}
+
+/// What the rays of a pixel met.
+#[derive(Default)]
+struct Visited {
+    steps: u32,
+    reads_bc4: bool,
 }
 
 struct Tracer<'a, F> {
@@ -154,26 +203,31 @@ struct Hit<F> {
 }
 
 impl<F: Real> Tracer<'_, F> {
-    fn pixel(&self, x: u32, y: u32) -> [f32; 4] {
+    fn ray(&self, x: u32, y: u32) -> Ray<F> {
         let [width, height] = self.scene.size;
         let at = |i: u32, n: u32| (2.0 * f64::from(i) + 1.0) / f64::from(n) - 1.0;
-        let ray = self.setup.lens.ray::<F>(at(x, width), -at(y, height));
-        let mut steps = 0;
+        self.setup.lens.ray(at(x, width), -at(y, height))
+    }
+
+    fn pixel(&self, x: u32, y: u32) -> ([f32; 4], bool) {
+        let ray = self.ray(x, y);
+        let mut visited = Visited::default();
         let color = if self.scene.mode == Mode::Density && !self.scene.level_set {
-            let depth = self.optical_depth(&ray, &mut steps);
-            let opacity = F::from_i32(1) - (-(depth * self.extinction)).exp();
-            [opacity.to_f64() as f32; 3]
+            let depth = self.optical_depth(&ray, &mut visited);
+            [opacity(depth, self.extinction).to_f64() as f32; 3]
         } else {
-            let hit = self.first_hit(&ray, &mut steps);
-            self.shade(&ray, hit, &mut steps)
+            let hit = self.first_hit(&ray, &mut visited);
+            self.shade(&ray, hit, &mut visited)
         };
-        let steps = steps as f32;
-        if self.scene.mode == Mode::Steps { [steps; 4] } else { [color[0], color[1], color[2], steps] }
+        let steps = visited.steps as f32;
+        let [r, g, b] = if self.scene.mode == Mode::Steps { [steps; 3] } else { color };
+        ([r, g, b, steps], visited.reads_bc4)
     }
 
     /// The voxel that a cell is, or has as its first corner.
     fn voxel(&self, cell: [i32; 3]) -> Coord {
-        Coord(std::array::from_fn(|a| cell[a] + self.setup.base[a]))
+        // A corner may lie behind the last voxel that there is: it wraps, as in the shader.
+        Coord(std::array::from_fn(|a| cell[a].wrapping_add(self.setup.base[a])))
     }
 
     fn skips(&self) -> bool {
@@ -182,12 +236,15 @@ impl<F: Real> Tracer<'_, F> {
 
     /// The node to step over (the whole of it for HDDA where it has one value, else one cell), whether
     /// it has one value, and the value of the cell's voxel.
-    fn node(&self, cell: [i32; 3]) -> (Box3, bool, f32) {
+    fn node(&self, cell: [i32; 3], visited: &mut Visited) -> (Box3, bool, f32) {
         let voxel = self.voxel(cell);
         let found = self.field.find(voxel);
         let (constant, value) = match found.content {
             Content::Constant(constant) => (true, constant.value),
-            Content::Brick(values, _) => (false, values[voxel.child_index(3, 1)]),
+            Content::Brick(brick) => {
+                visited.reads_bc4 |= brick.is_bc4;
+                (false, brick.values[voxel.child_index(3, 1)])
+            }
         };
         if constant && self.skips() {
             let min = std::array::from_fn(|a| found.origin.0[a] - self.setup.base[a]);
@@ -196,32 +253,32 @@ impl<F: Real> Tracer<'_, F> {
         (Box3::cube(cell, 1), constant, value)
     }
 
-    /// The integral of density over distance.
-    fn optical_depth(&self, ray: &Ray<F>, steps: &mut u32) -> F {
+    /// The integral of density over distance. What is below 0 absorbs nothing.
+    fn optical_depth(&self, ray: &Ray<F>, visited: &mut Visited) -> F {
         let mut depth = F::from_i32(0);
         let bounds = self.setup.bounds;
         let Some(mut walk) = Walk::enter(ray, bounds) else { return depth };
-        while bounds.contains(walk.cell) && *steps < MAX_STEPS {
-            *steps += 1;
-            let (node, _, value) = self.node(walk.cell);
+        while bounds.contains(walk.cell) && visited.steps < MAX_STEPS {
+            visited.steps += 1;
+            let (node, _, value) = self.node(walk.cell, visited);
             let from = walk.t;
             walk.leave(ray, node.within(bounds));
-            depth = depth + (walk.t - from) * F::from_f64(value.into());
+            depth = depth + (walk.t - from) * F::from_f64(value.max(0.0).into());
         }
         depth
     }
 
-    fn first_hit(&self, ray: &Ray<F>, steps: &mut u32) -> Option<Hit<F>> {
+    fn first_hit(&self, ray: &Ray<F>, visited: &mut Visited) -> Option<Hit<F>> {
         let bounds = self.setup.bounds;
         let walk = Walk::enter(ray, bounds)?;
         if self.scene.is_trilinear() {
-            return self.first_surface(ray, bounds, walk, steps);
+            return self.first_surface(ray, bounds, walk, visited);
         }
         if !self.scene.level_set {
-            return self.first_voxel(ray, bounds, walk, steps, |value| value > self.scene.threshold);
+            return self.first_voxel(ray, bounds, walk, visited, |value| value > self.scene.threshold);
         }
-        let mut negative = None;
-        let hit = self.first_voxel(ray, bounds, walk, steps, |value| {
+        let mut negative = self.sign_before(&walk);
+        let hit = self.first_voxel(ray, bounds, walk, visited, |value| {
             *negative.get_or_insert(value < 0.0) != (value < 0.0)
         });
         hit.map(|hit| Hit { value: 1.0, ..hit })
@@ -232,18 +289,24 @@ impl<F: Real> Tracer<'_, F> {
         ray: &Ray<F>,
         bounds: Box3,
         mut walk: Walk<F>,
-        steps: &mut u32,
+        visited: &mut Visited,
         mut is_hit: impl FnMut(f32) -> bool,
     ) -> Option<Hit<F>> {
-        while bounds.contains(walk.cell) && *steps < MAX_STEPS {
-            *steps += 1;
-            let (node, _, value) = self.node(walk.cell);
+        while bounds.contains(walk.cell) && visited.steps < MAX_STEPS {
+            visited.steps += 1;
+            let (node, _, value) = self.node(walk.cell, visited);
             if is_hit(value) {
                 return Some(Hit { t: walk.t, cell: walk.cell, normal: None, axis: walk.axis, value });
             }
             walk.leave(ray, node.within(bounds));
         }
         None
+    }
+
+    /// Whether it is negative where a walk comes from: the background is, or is not; nothing is known of where a ray
+    /// begins inside.
+    fn sign_before(&self, walk: &Walk<F>) -> Option<bool> {
+        (walk.axis < 3).then_some(self.field.background < 0.0)
     }
 
     /// The first zero of the interpolated field. A cell reaches over to the next voxel on each axis, so
@@ -253,34 +316,42 @@ impl<F: Real> Tracer<'_, F> {
         ray: &Ray<F>,
         bounds: Box3,
         mut walk: Walk<F>,
-        steps: &mut u32,
+        visited: &mut Visited,
     ) -> Option<Hit<F>> {
-        let mut negative = None;
-        while bounds.contains(walk.cell) && *steps < MAX_STEPS {
-            *steps += 1;
-            let (node, constant, value) = self.node(walk.cell);
+        let mut negative = self.sign_before(&walk);
+        while bounds.contains(walk.cell) && visited.steps < MAX_STEPS {
+            visited.steps += 1;
+            let (node, constant, value) = self.node(walk.cell, visited);
             let alone = constant && self.skips() && self.field.is_alone(self.voxel(walk.cell));
             let inner = Box3 { min: node.min, max: node.max.map(|v| v - i32::from(!alone)) };
             if constant && inner.contains(walk.cell) {
                 let sign = value < 0.0;
                 if negative.is_some_and(|n| n != sign) {
-                    return Some(self.surface_hit(ray, &walk, walk.t));
+                    return Some(self.surface_hit(ray, &walk, walk.t, visited));
                 }
                 negative = Some(sign);
                 walk.leave(ray, inner.within(bounds));
                 continue;
             }
-            let corners = self.corners(walk.cell);
+            let corners = self.corners(walk.cell, visited);
             let cell = Box3::cube(walk.cell, 1);
+            let first = corners[0] < F::from_i32(0);
+            let is_mixed = |negative: bool| corners.iter().any(|v| (*v < F::from_i32(0)) != negative);
+            // Where all corners are of one sign, so is the cell, whatever rounding makes of its interpolant.
+            if !is_mixed(first) && negative.is_none_or(|n| n == first) {
+                negative = Some(first);
+                walk.leave(ray, cell);
+                continue;
+            }
             let (exit, _) = walk.exit(ray, cell);
             let from = self.local(ray, walk.cell, walk.t);
             let along = std::array::from_fn(|a| ray.direction[a] * (exit - walk.t));
             let c = cubic(corners, from, along);
             let start = *negative.get_or_insert(evaluate(c, F::from_i32(0)) < F::from_i32(0));
-            if corners.iter().any(|v| (*v < F::from_i32(0)) != start)
+            if is_mixed(start)
                 && let Some(u) = first_change(c, start)
             {
-                return Some(self.surface_hit(ray, &walk, walk.t + (exit - walk.t) * u));
+                return Some(self.surface_hit(ray, &walk, walk.t + (exit - walk.t) * u, visited));
             }
             walk.leave(ray, cell);
         }
@@ -293,15 +364,16 @@ impl<F: Real> Tracer<'_, F> {
     }
 
     /// The voxels at a cell's corners, ordered by x + 2y + 4z.
-    fn corners(&self, cell: [i32; 3]) -> [F; 8] {
+    fn corners(&self, cell: [i32; 3], visited: &mut Visited) -> [F; 8] {
         std::array::from_fn(|i| {
             let corner = std::array::from_fn(|a| cell[a] + (i >> a & 1) as i32);
-            F::from_f64(self.field.value(self.voxel(corner)).into())
+            let (_, _, value) = self.node(corner, visited);
+            F::from_f64(value.into())
         })
     }
 
-    fn surface_hit(&self, ray: &Ray<F>, walk: &Walk<F>, t: F) -> Hit<F> {
-        let c = self.corners(walk.cell).map(Real::to_f64);
+    fn surface_hit(&self, ray: &Ray<F>, walk: &Walk<F>, t: F, visited: &mut Visited) -> Hit<F> {
+        let c = self.corners(walk.cell, visited).map(Real::to_f64);
         let p = self.local(ray, walk.cell, t).map(|v| v.to_f64().clamp(0.0, 1.0));
         let gradient: [f64; 3] = std::array::from_fn(|a| {
             (0..8)
@@ -317,7 +389,7 @@ impl<F: Real> Tracer<'_, F> {
         Hit { t, cell: walk.cell, normal: Some(normalise(world)), axis: walk.axis, value: 1.0 }
     }
 
-    fn shade(&self, ray: &Ray<F>, hit: Option<Hit<F>>, steps: &mut u32) -> [f32; 3] {
+    fn shade(&self, ray: &Ray<F>, hit: Option<Hit<F>>, visited: &mut Visited) -> [f32; 3] {
         let Some(hit) = hit else {
             return if self.scene.mode == Mode::Depth { [-1.0; 3] } else { [0.0; 3] };
         };
@@ -327,7 +399,7 @@ impl<F: Real> Tracer<'_, F> {
             Mode::Bricks => brick_hue(self.voxel(hit.cell).0),
             Mode::Nodes => self.node_color(ray, &hit),
             Mode::Normals => self.normal(ray, &hit).map(|n| (n * 0.5 + 0.5) as f32),
-            Mode::Density | Mode::Lit => [self.lit(ray, &hit, steps) as f32; 3],
+            Mode::Density | Mode::Lit => [self.lit(ray, &hit, visited) as f32; 3],
             Mode::Steps => [0.0; 3],
         }
     }
@@ -343,7 +415,7 @@ impl<F: Real> Tracer<'_, F> {
         })
     }
 
-    fn lit(&self, ray: &Ray<F>, hit: &Hit<F>, steps: &mut u32) -> f64 {
+    fn lit(&self, ray: &Ray<F>, hit: &Hit<F>, visited: &mut Visited) -> f64 {
         let normal = self.normal(ray, hit);
         let facing = dot(normal, self.setup.sun_world);
         if facing <= 0.0 {
@@ -352,7 +424,7 @@ impl<F: Real> Tracer<'_, F> {
         let sun = self.setup.sun.map(F::from_f64);
         let origin = std::array::from_fn(|a| ray.origin[a] + ray.direction[a] * hit.t + sun[a]);
         let shadow = Ray::new(origin, sun);
-        if self.first_hit(&shadow, steps).is_some() { AMBIENT } else { AMBIENT + (1.0 - AMBIENT) * facing }
+        if self.first_hit(&shadow, visited).is_some() { AMBIENT } else { AMBIENT + (1.0 - AMBIENT) * facing }
     }
 
     /// Blue, red or cyan near a boundary of an L1, L2 or L3 node on the face that was hit; else grey.

@@ -5,8 +5,7 @@ use std::collections::HashMap;
 use crate::codec::Codec;
 use crate::pack::{FrameReader, PackError, Region};
 use crate::volume::{
-    BRICK_DIM, BRICK_VOXELS, CELL_DIM, CellContent, Child, Constant, Coord, CoordBox, FlatFrame, Mask512,
-    ROOT_DIM,
+    BRICK_DIM, BRICK_VOXELS, CELL_DIM, CellContent, Child, Constant, Coord, CoordBox, FlatFrame, ROOT_DIM,
 };
 
 /// A frame as nested constants and bricks of values.
@@ -17,7 +16,15 @@ pub struct Field {
     pub bounds: CoordBox,
     roots: HashMap<Coord, Constant>,
     cells: HashMap<Coord, Cell>,
-    bricks: Vec<(Box<[f32; BRICK_VOXELS]>, Mask512)>,
+    bricks: Vec<FieldBrick>,
+}
+
+/// 512 voxels of a frame.
+pub struct FieldBrick {
+    /// Their values, x slowest.
+    pub values: Box<[f32; BRICK_VOXELS]>,
+    /// Whether they are interpolated between the endpoints of BC4 blocks, which each GPU does in its own way.
+    pub is_bc4: bool,
 }
 
 enum Cell {
@@ -46,7 +53,7 @@ pub enum Content<'a> {
     /// One value.
     Constant(Constant),
     /// 512 voxels.
-    Brick(&'a [f32; BRICK_VOXELS], &'a Mask512),
+    Brick(&'a FieldBrick),
 }
 
 impl Field {
@@ -77,7 +84,10 @@ impl Field {
                             Child::Constant(constant) => field.put_region(origin, constant),
                             Child::Brick(i) => {
                                 let brick = bricks[i as usize].take().expect("each brick is named once");
-                                field.put_brick(origin, Box::new(brick.values), brick.active);
+                                field.put_brick(
+                                    origin,
+                                    FieldBrick { values: Box::new(brick.values), is_bc4: false },
+                                );
                             }
                         }
                     }
@@ -103,7 +113,10 @@ impl Field {
                 field.put_region(origin, Constant { value, active: value != field.background });
             }
             Region::Brick(record) => match frame.decode(&record) {
-                Ok(brick) => field.put_brick(origin, brick.values, brick.active),
+                Ok(brick) => {
+                    let is_bc4 = record.codec == Codec::Bc4;
+                    field.put_brick(origin, FieldBrick { values: brick.values, is_bc4 });
+                }
                 Err(e) => result = Err(e),
             },
         });
@@ -136,10 +149,10 @@ impl Field {
         constants.push(constant);
     }
 
-    fn put_brick(&mut self, origin: Coord, values: Box<[f32; BRICK_VOXELS]>, mask: Mask512) {
+    fn put_brick(&mut self, origin: Coord, brick: FieldBrick) {
         let number = self.bricks.len() as u32 + 1;
         *self.place(origin).0 = number;
-        self.bricks.push((values, mask));
+        self.bricks.push(brick);
     }
 
     /// The node around a voxel.
@@ -156,10 +169,7 @@ impl Field {
                 let content = match places[at.child_index(4, BRICK_DIM)] {
                     0 => background,
                     c if c & CONSTANT != 0 => Content::Constant(constants[(c & !CONSTANT) as usize]),
-                    brick => {
-                        let (values, mask) = &self.bricks[brick as usize - 1];
-                        Content::Brick(values, mask)
-                    }
+                    brick => Content::Brick(&self.bricks[brick as usize - 1]),
                 };
                 found(content, BRICK_DIM)
             }
@@ -178,13 +188,5 @@ impl Field {
                 let next = at.offset_by([side(0), side(1), side(2)]);
                 places[next.child_index(4, BRICK_DIM)] == 0
             })
-    }
-
-    /// One voxel's value.
-    pub fn value(&self, at: Coord) -> f32 {
-        match self.find(at).content {
-            Content::Constant(constant) => constant.value,
-            Content::Brick(values, _) => values[at.child_index(3, 1)],
-        }
     }
 }

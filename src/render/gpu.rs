@@ -10,7 +10,7 @@ use wgpu::util::DeviceExt;
 
 use self::params::Params;
 use self::pipelines::{Has, Pipelines, WORKGROUP};
-use super::cpu::Scene;
+use super::cpu::{Scene, TraceError};
 use super::image::Image;
 use crate::codec::Codec;
 use crate::pack::{Atlas, Pack, PackError};
@@ -42,9 +42,9 @@ pub enum GpuError {
     /// The pack is damaged.
     #[error(transparent)]
     Pack(#[from] PackError),
-    /// The scene's matrix cannot be inverted.
-    #[error("the grid's transform cannot be inverted")]
-    Transform,
+    /// No tracer can trace the frame.
+    #[error(transparent)]
+    Trace(#[from] TraceError),
 }
 
 /// A device that can trace.
@@ -226,9 +226,7 @@ impl Gpu {
         }
         let params = self.device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
             label: Some("params"),
-            contents: bytemuck::bytes_of(
-                &Params::new(scene, [grid, frame], voxels).ok_or(GpuError::Transform)?,
-            ),
+            contents: bytemuck::bytes_of(&Params::new(scene, [grid, frame], voxels)?),
             usage: wgpu::BufferUsages::UNIFORM,
         });
         let buffer = |size, usage| {

@@ -3,6 +3,7 @@
 use std::io::{self, Write};
 
 use super::Mode;
+use super::traverse::Real;
 
 /// A traced picture.
 #[derive(Clone, Debug, PartialEq)]
@@ -36,10 +37,39 @@ impl Image {
         self.pixels.iter().flat_map(|p| color(p).map(to_srgb8)).collect()
     }
 
+    /// The opacity of fog from the density along the ray of each pixel, by Beer and Lambert. Nothing is said of steps.
+    pub fn of_optical_depths(size: [u32; 2], depths: &[f32], extinction: f64) -> Self {
+        let pixel = |depth: &f32| {
+            let opacity = opacity(*depth, extinction as f32);
+            [opacity, opacity, opacity, 0.0]
+        };
+        Self { size, pixels: depths.iter().map(pixel).collect() }
+    }
+
     /// The mean number of steps a ray took.
     pub fn mean_steps(&self) -> f64 {
         self.pixels.iter().map(|p| f64::from(p[3])).sum::<f64>() / self.pixels.len().max(1) as f64
     }
+}
+
+/// How much of what is behind is hidden by so much density along a ray.
+pub fn opacity<F: Real>(depth: F, extinction: F) -> F {
+    F::from_i32(1) - (-(depth * extinction)).exp()
+}
+
+/// The largest difference of two pixels' numbers, of the larger of the two or of 1. A number that is none is far from any.
+pub fn apart(a: &[f32], b: &[f32]) -> f32 {
+    let apart = |(a, b): (&f32, &f32)| {
+        let apart = (a - b).abs() / a.abs().max(b.abs()).max(1.0);
+        if a == b {
+            0.0
+        } else if apart.is_finite() {
+            apart
+        } else {
+            f32::MAX
+        }
+    };
+    a.iter().zip(b).map(apart).fold(0.0, f32::max)
 }
 
 fn to_srgb8(v: f32) -> u8 {

@@ -18,10 +18,10 @@ mod renderer;
 mod surface;
 mod traverse;
 
-pub use camera::{Camera, CameraError, Lens, View};
-pub use cpu::{Scene, trace};
+pub use camera::{Camera, CameraError, Lens, View, WorldBox};
+pub use cpu::{Scene, TraceError, optical_depths, trace, trace_noting_bc4};
 pub use field::Field;
-pub use image::{Difference, Image, difference, write_apng, write_png};
+pub use image::{Difference, Image, apart, difference, write_apng, write_png};
 pub use renderer::{Device, Renderer};
 pub use traverse::{Box3, Ray, Real, Walk};
 

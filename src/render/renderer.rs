@@ -84,5 +84,5 @@ impl<'a> Renderer<'a> {
 }
 
 fn on_cpu(reader: &FrameReader, scene: &Scene) -> Result<Image, GpuError> {
-    trace::<f32>(&Field::from_pack(reader)?, scene).ok_or(GpuError::Transform)
+    Ok(trace::<f32>(&Field::from_pack(reader)?, scene)?)
 }

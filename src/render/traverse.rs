@@ -70,7 +70,7 @@ real!(f32);
 real!(f64);
 
 /// Cells farther out than this are not told apart: `f32` has no fractions left there.
-const MAX_CELL: i32 = 1 << 24;
+pub const MAX_CELL: i32 = 1 << 24;
 
 /// A ray in cell space.
 #[derive(Clone, Copy, Debug)]

@@ -7,10 +7,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::cache::{Cache, Key, Stage};
 use crate::error::{Error, Result};
-use crate::pack::Pack;
+use crate::pack::{Grid, Pack};
 use crate::render::{Field, Mode, Scene, View, trace, write_png};
-use crate::verify::{Sources, VerifyReport, difference_map, look, shown_frames};
-use crate::volume::CoordBox;
+use crate::verify::{Seen, Sources, VerifyReport, difference_map, look, shown_frames};
 
 /// Frames of a strip, at most: what still shows how a sequence moves, in 400 KB.
 const STRIP_FRAMES: usize = 24;
@@ -18,7 +17,7 @@ const STRIP_FRAMES: usize = 24;
 const STRIP_SIDE: u32 = 96;
 
 /// Pictures are drawn once for a pack.
-const STAGE: Stage = Stage { name: "gallery", version: 1, travels: true };
+const STAGE: Stage = Stage { name: "gallery", version: 2, travels: true };
 
 /// A pack's pictures.
 #[derive(Clone, Debug, Serialize, Deserialize)]
@@ -85,7 +84,13 @@ pub fn gallery(
 ) -> Result<Gallery> {
     let worst = found.and_then(|found| found.worst_frame.as_ref());
     let worst = worst.map(|worst| (worst.grid.as_str(), worst.frame));
-    let key = Key::new(&STAGE, &(digest, files.is_some(), worst));
+    // One for all pictures of a grid.
+    let pictures = found.and_then(|found| found.pictures.as_ref()).map_or(&[][..], |found| &found.pictures);
+    let extinction = |grid: &Grid| {
+        pictures.iter().find(|picture| picture.grid == grid.name).map(|picture| picture.extinction)
+    };
+    let extinctions: Vec<Option<f64>> = pack.grids.iter().map(extinction).collect();
+    let key = Key::new(&STAGE, &(digest, files.is_some(), worst, &extinctions));
     if let Some(known) = cache.and_then(|cache| cache.get(&key)) {
         return Ok(known);
     }
@@ -100,9 +105,12 @@ pub fn gallery(
         shown.dedup();
         places.extend(shown.into_iter().map(|f| ([g, f], is_worst(f))));
     }
-    let key_frames =
-        places.into_par_iter().map(|(place, is_worst)| key_frame(pack, sources, place, is_worst));
-    let strips = (0..pack.grids.len()).map(|g| strip(pack, g));
+    let key_frame = |(place, is_worst): ([usize; 2], bool)| {
+        let Some(seen) = look(pack, sources, place, extinctions[place[0]])? else { return Ok(None) };
+        Ok(Some(KeyFrame::new(&pack.grids[place[0]], place[1], is_worst, &seen)))
+    };
+    let key_frames = places.into_par_iter().map(key_frame);
+    let strips = extinctions.iter().enumerate().map(|(g, extinction)| strip(pack, g, *extinction));
     let gallery = Gallery {
         key_frames: key_frames.collect::<Result<Vec<_>>>()?.into_iter().flatten().collect(),
         strips: strips.collect::<Result<Vec<_>>>()?.into_iter().flatten().collect(),
@@ -113,27 +121,23 @@ pub fn gallery(
     Ok(gallery)
 }
 
-fn key_frame(
-    pack: &Pack,
-    sources: Option<&Sources>,
-    [g, f]: [usize; 2],
-    is_worst: bool,
-) -> Result<Option<KeyFrame>> {
-    let grid = &pack.grids[g];
-    let Some(seen) = look(pack, sources, [g, f])? else { return Ok(None) };
-    let png = |rgb: &[u8]| Png::new([seen.side; 2], rgb);
-    Ok(Some(KeyFrame {
-        grid: grid.name.clone(),
-        frame: grid.frames[f].record.number,
-        is_worst,
-        side: seen.side,
-        pack: png(&seen.pack),
-        source: seen.source.as_ref().map(|source| [png(source), png(&difference_map(source, &seen.pack))]),
-    }))
+impl KeyFrame {
+    fn new(grid: &Grid, frame: usize, is_worst: bool, seen: &Seen) -> Self {
+        let png = |rgb: &[u8]| Png::new([seen.side; 2], rgb);
+        let difference = |source: &Vec<u8>| [png(source), png(&difference_map(source, &seen.pack))];
+        Self {
+            grid: grid.name.clone(),
+            frame: grid.frames[frame].record.number,
+            is_worst,
+            side: seen.side,
+            pack: png(&seen.pack),
+            source: seen.source.as_ref().map(difference),
+        }
+    }
 }
 
-/// `None` for a grid of less than two frames, where there is nothing to play.
-fn strip(pack: &Pack, g: usize) -> Result<Option<Strip>> {
+/// `None` for a grid of less than two frames, where there is nothing to play, and for one that cannot be traced.
+fn strip(pack: &Pack, g: usize, extinction: Option<f64>) -> Result<Option<Strip>> {
     let grid = &pack.grids[g];
     let all = grid.frames.len();
     if all < 2 {
@@ -141,26 +145,18 @@ fn strip(pack: &Pack, g: usize) -> Result<Option<Strip>> {
     }
     let count = all.min(STRIP_FRAMES);
     let frames: Vec<usize> = (0..count).map(|i| i * (all - 1) / (count - 1)).collect();
-    // One camera for all: around everything that any of them has.
-    let mut bounds = CoordBox::EMPTY;
-    frames.iter().for_each(|&f| bounds.union(pack.frame_tree(g, f).bounds()));
-    if bounds.is_empty() {
-        return Ok(None);
-    }
     let mode = Mode::of_grid(grid);
-    let draw = |&f: &usize| -> Result<Vec<u8>> {
+    let draw = |&f: &usize| -> Result<Option<Vec<u8>>> {
         crate::interrupt::check()?;
-        let frame = &grid.frames[f];
-        let broken = |e: &dyn std::fmt::Display| {
-            Error::Verify(format!("grid {:?} frame {}: {e}", grid.name, frame.record.number))
-        };
-        let field = Field::from_pack(&pack.frame(g, f).map_err(|e| broken(&e))?).map_err(|e| broken(&e))?;
-        let scene = Scene::new(grid, frame, bounds, &View::default(), mode, [STRIP_SIDE; 2]);
-        let image =
-            trace::<f32>(&field, &scene).ok_or_else(|| broken(&"its transform cannot be inverted"))?;
-        Ok(image.to_rgb8(mode))
+        let field = pack.frame(g, f).and_then(|reader| Field::from_pack(&reader)).map_err(|e| {
+            Error::Verify(format!("grid {:?} frame {}: {e}", grid.name, grid.frames[f].record.number))
+        })?;
+        let scene = Scene::new(grid, f, &View::default(), mode, [STRIP_SIDE; 2]);
+        let scene = Scene { extinction: extinction.unwrap_or(scene.extinction), ..scene };
+        Ok(trace::<f32>(&field, &scene).ok().map(|image| image.to_rgb8(mode)))
     };
-    let pictures = frames.par_iter().map(draw).collect::<Result<Vec<_>>>()?;
+    let pictures = frames.par_iter().map(draw).collect::<Result<Option<Vec<_>>>>()?;
+    let Some(pictures) = pictures else { return Ok(None) };
     let row = STRIP_SIDE as usize * 3;
     let mut rgb = Vec::with_capacity(pictures.len() * row * STRIP_SIDE as usize);
     for y in 0..STRIP_SIDE as usize {

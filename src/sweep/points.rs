@@ -161,7 +161,7 @@ fn trace(gpu: &Gpu, pack: &Pack, size: [u32; 2], repeats: u32) -> Option<f64> {
     let frame = grid.frames.len() - 1;
     let bounds = pack.frame_tree(0, frame).bounds();
     let mode = if grid.record.class == GridClass::LevelSet as u32 { Mode::Depth } else { Mode::Density };
-    let scene = Scene::new(grid, &grid.frames[frame], bounds, &View::default(), mode, size);
+    let scene = Scene::new(grid, frame, &View::default(), mode, size);
     let median = |repeats| {
         let (_, mut ms) = gpu.trace_timed(&uploaded, [0, frame as u32], bounds, &scene, repeats).ok()?;
         ms.sort_by(f64::total_cmp);

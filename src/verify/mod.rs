@@ -113,13 +113,8 @@ fn compare_source(pack: &Pack, source: usize, path: &Path) -> Result<Vec<(usize,
     for (g, grid) in pack.grids.iter().enumerate() {
         let of_source = |f: &crate::pack::Frame| f.record.source as usize == source;
         for f in (0..grid.frames.len()).filter(|&f| of_source(&grid.frames[f])) {
-            let info = find(&file.grids, &grid.name).ok_or_else(|| {
-                Error::Verify(format!(
-                    "{}: grid {:?} is in the pack, but not in the file",
-                    path.display(),
-                    grid.name
-                ))
-            })?;
+            let info =
+                find(&file.grids, &grid.name).ok_or_else(|| pictures::missing_grid(path, &grid.name))?;
             let reader = pack.frame(g, f).map_err(|e| {
                 Error::Verify(format!("grid {:?} frame {}: {e}", grid.name, grid.frames[f].record.number))
             })?;

@@ -91,6 +91,11 @@ impl CoordBox {
         }
     }
 
+    /// The box of six integers: minimum, then maximum.
+    pub fn from_array([a, b, c, d, e, f]: [i32; 6]) -> Self {
+        Self { min: Coord([a, b, c]), max: Coord([d, e, f]) }
+    }
+
     /// The six integers that reports print: minimum, then maximum.
     pub fn to_array(self) -> [i32; 6] {
         let ([a, b, c], [d, e, f]) = (self.min.0, self.max.0);

@@ -2,11 +2,13 @@
 
 #![allow(dead_code)] // Each test file uses a part of it.
 
+use std::io::Write;
 use std::path::{Path, PathBuf};
 
 use serde_json::Value as Json;
 use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
+use volpack::render::gpu::Gpu;
 use volpack::settings::Settings;
 use volpack::verify::VerifyReport;
 
@@ -30,6 +32,22 @@ pub fn fixtures() -> Vec<PathBuf> {
 /// The eight frames of the animation.
 pub fn animation() -> Vec<PathBuf> {
     (1..=8).map(|n| fixture(&format!("anim_{n:04}.vdb"))).collect()
+}
+
+/// Says that a test is skipped for want of something. Standard error itself, since the harness keeps what passing tests
+/// print to itself.
+///
+/// # Panics
+/// When `VOLPACK_REQUIRE_` and what is wanted is set, as where CI runs: there nothing is skipped.
+pub fn skip(wanted: &str, why: &str) {
+    let test = std::thread::current().name().unwrap_or("a test").to_owned();
+    assert!(std::env::var_os(format!("VOLPACK_REQUIRE_{wanted}")).is_none(), "{test}: {why}");
+    writeln!(std::io::stderr(), "skipped: {test}: {why}").unwrap();
+}
+
+/// The device of tests that need one; they are skipped where there is none.
+pub fn gpu() -> Option<&'static Gpu> {
+    Gpu::shared().map_err(|e| skip("GPU", &e.to_string())).ok()
 }
 
 /// What OpenVDB says of each grid of a file.

@@ -29,6 +29,8 @@ pub struct GridFile<V> {
     pub background: V,
     /// The voxels' edge in world units.
     pub voxel_size: f64,
+    /// Where voxel 0 is in world space.
+    pub translation: [f64; 3],
     /// Leaves by their smallest corner, a multiple of 8: values x slowest, and which of them are active.
     pub leaves: BTreeMap<Coord, ([V; BRICK_VOXELS], Mask512)>,
 }
@@ -43,6 +45,7 @@ impl<V: Pod> GridFile<V> {
             flags: Vec::new(),
             background,
             voxel_size: 0.1,
+            translation: [0.0; 3],
             leaves: BTreeMap::new(),
         }
     }
@@ -90,7 +93,8 @@ impl<V: Pod> GridFile<V> {
             string(&mut out, "bool");
             out.extend([1, 0, 0, 0, u8::from(*value)]);
         }
-        string(&mut out, "UniformScaleMap");
+        string(&mut out, "UniformScaleTranslateMap");
+        self.translation.iter().for_each(|value| out.extend(value.to_le_bytes()));
         // Scale, voxel size, and three inverses derived from the scale.
         let (s, inverse) = (self.voxel_size, 1.0 / self.voxel_size);
         for value in [s, s, inverse, inverse * inverse, inverse / 2.0] {

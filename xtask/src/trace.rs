@@ -66,7 +66,6 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     for path in &args.files {
         let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         let mut theirs: Vec<(&str, &str, Theirs)> = Vec::new();
-        let mut camera = None;
         let mut lines = Vec::new();
         for format in Format::ALL {
             let job = Job::new(
@@ -81,10 +80,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             let bounds = pack.frame_tree(0, 0).bounds();
             let grid = &pack.grids[0];
             for &(shows, mode, interpolation) in if grid.record.class == 1 { LEVEL_SET } else { FOG } {
-                let scene = Scene::new(grid, &grid.frames[0], bounds, &VIEW, mode, size);
-                // That of the first format for all: lossy packs may have a smaller box.
-                let camera = *camera.get_or_insert(scene.camera);
-                let scene = Scene { camera, interpolation, ..scene };
+                let scene = Scene { interpolation, ..Scene::new(grid, 0, &VIEW, mode, size) };
                 if let (Format::F32, Ok(peer)) = (format, &peer) {
                     // What the converter itself allows: a tenth of a voxel where there is a level set.
                     let absolute = if scene.level_set {

@@ -2,7 +2,7 @@
 
 use bytemuck::{Pod, Zeroable};
 
-use crate::render::cpu::{AMBIENT, Scene, Setup};
+use crate::render::cpu::{AMBIENT, Scene, Setup, TraceError};
 use crate::volume::CoordBox;
 
 /// `struct Params` of `tracer.wgsl`: vectors of three are aligned to four words, and numbers fill the gaps.
@@ -31,11 +31,14 @@ pub struct Params {
 }
 
 impl Params {
-    /// `None` if the scene's matrix cannot be inverted.
-    pub fn new(scene: &Scene, [grid, frame]: [u32; 2], voxels: CoordBox) -> Option<Self> {
+    /// What a scene asks.
+    ///
+    /// # Errors
+    /// [`TraceError`].
+    pub fn new(scene: &Scene, [grid, frame]: [u32; 2], voxels: CoordBox) -> Result<Self, TraceError> {
         let setup = Setup::new(scene, voxels)?;
         let f = |v: [f64; 3]| v.map(|v| v as f32);
-        Some(Self {
+        Ok(Self {
             origin: f(setup.lens.origin),
             width: scene.size[0],
             forward: f(setup.lens.forward),

@@ -83,6 +83,7 @@ fn traced(walk: VpWalk) -> bool {
     return vp_inside(walk.cell, params.low, params.high) && steps < MAX_STEPS;
 }
 
+// The integral of density over distance. What is below 0 absorbs nothing.
 fn optical_depth(ray: VpRay) -> f32 {
     var depth = 0.0;
     var walk = vp_enter(ray, params.low, params.high);
@@ -98,7 +99,7 @@ fn optical_depth(ray: VpRay) -> f32 {
             steps++;
             let start = walk.t;
             walk = vp_leave(ray, walk, at.low, at.high);
-            depth += (walk.t - start) * at.node.value;
+            depth += (walk.t - start) * max(at.node.value, 0.0);
             continue;
         }
         let brick = vp_brick(g, at.node);
@@ -108,7 +109,7 @@ fn optical_depth(ray: VpRay) -> f32 {
             let value = vp_value(g, brick, walk.cell + params.base);
             let start = walk.t;
             walk = vp_step(ray, walk);
-            depth += (walk.t - start) * value;
+            depth += (walk.t - start) * max(value, 0.0);
             if any(walk.cell == behind) {
                 break;
             }
@@ -180,7 +181,8 @@ fn first_sign(ray: VpRay) -> Hit {
     }
     let g = vp_grid(params.grid);
     var cell = VP_NOWHERE;
-    var first = VP_EITHER;
+    // Before the box the sign is the background's.
+    var first = select(VP_EITHER, u32(g.background < 0.0), walk.axis < 3);
     while traced(walk) {
         let at = place_of(g, cell, walk.cell);
         cell = at.cell;
@@ -229,8 +231,9 @@ fn first_surface(ray: VpRay) -> Hit {
     }
     let g = vp_grid(params.grid);
     var l2 = VP_NOWHERE;
-    var known = false;      // whether a sign has been seen,
-    var negative = false;   // and which
+    // Whether the sign is known, and whether it is negative: before the box it is the background's.
+    var known = walk.axis < 3;
+    var negative = known && g.background < 0.0;
     while traced(walk) {
         let at = place_of(g, l2, walk.cell);
         l2 = at.cell;
@@ -283,15 +286,22 @@ fn first_surface(ray: VpRay) -> Hit {
                 negative = seen == 2u;
             } else {
                 let corners = vp_corners(g, params.frame, l2, brick, p);
-                let exit = vp_least(walk.next);
-                let along = ray.direction * (exit - walk.t);
-                let c = cubic(corners, local(ray, walk.cell, walk.t), along);
-                negative = select(c.x < 0.0, negative, known);
-                known = true;
-                if mixed(corners, negative) {
-                    let u = first_change(c, negative);
-                    if u >= 0.0 {
-                        return Hit(true, walk.t + (exit - walk.t) * u, walk.cell, walk.axis, 1.0);
+                let first = corners.near.x < 0.0;
+                if !mixed(corners, first) && (!known || negative == first) {
+                    // So is the cell, whatever rounding makes of its interpolant.
+                    known = true;
+                    negative = first;
+                } else {
+                    let exit = vp_least(walk.next);
+                    let along = ray.direction * (exit - walk.t);
+                    let c = cubic(corners, local(ray, walk.cell, walk.t), along);
+                    negative = select(c.x < 0.0, negative, known);
+                    known = true;
+                    if mixed(corners, negative) {
+                        let u = first_change(c, negative);
+                        if u >= 0.0 {
+                            return Hit(true, walk.t + (exit - walk.t) * u, walk.cell, walk.axis, 1.0);
+                        }
                     }
                 }
             }
@@ -391,7 +401,11 @@ fn normal_at(ray: VpRay, hit: Hit) -> vec3f {
         mix(x.y - x.x, x.w - x.z, p.z),
         mix(x.z - x.x, x.w - x.y, p.y),
     );
-    return normalize(vec3f(dot(params.normal_x, gradient), dot(params.normal_y, gradient), dot(params.normal_z, gradient)));
+    let normal =
+        vec3f(dot(params.normal_x, gradient), dot(params.normal_y, gradient), dot(params.normal_z, gradient));
+    // Where all corners are zero there is none.
+    let size = length(normal);
+    return select(normal, normal / size, size > 0.0);
 }
 
 fn lit(ray: VpRay, hit: Hit) -> f32 {
