@@ -7,8 +7,8 @@ use serde::Deserialize;
 
 use crate::error::{Error, Result};
 use crate::settings::{
-    Budget, ByteSize, ClusterArgs, DEFAULT_ZSTD, Dedup, ErrorBound, Format, Masks, NonFinite, QualityArgs,
-    RangeMode, Settings,
+    Budget, ByteSize, ClusterArgs, DEFAULT_ZSTD, Dedup, ErrorBound, Format, Integers, Masks, NonFinite,
+    QualityArgs, RangeMode, Settings,
 };
 
 /// The manifest's name where none is given.
@@ -72,6 +72,8 @@ struct RawAsset {
     masks: Masks,
     #[serde(default)]
     nonfinite: NonFinite,
+    #[serde(default)]
+    integers: Integers,
     zstd: Option<toml::Spanned<i32>>,
     fps: Option<toml::Spanned<f32>>,
     max_flip: Option<toml::Spanned<f64>>,
@@ -181,6 +183,7 @@ impl RawAsset {
                 range: self.range,
                 masks: self.masks,
                 nonfinite: self.nonfinite,
+                integers: self.integers,
                 zstd,
                 fps,
             },

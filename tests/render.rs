@@ -35,7 +35,7 @@ fn scene(
         camera,
         size: SIZE,
         matrix: record.transform,
-        level_set: pack.grids[0].record.class == 1,
+        level_set: pack.grids[0].is_level_set(),
         interpolation,
         extinction: 0.5,
         threshold: 0.05 * pack.grids[0].record.active_max,
@@ -46,7 +46,7 @@ fn scene(
 fn modes(pack: &Pack) -> impl Iterator<Item = (Mode, Interpolation)> {
     let trilinear = Mode::ALL.into_iter().map(|mode| (mode, Interpolation::Trilinear));
     let nearest = Mode::ALL.into_iter().map(|mode| (mode, Interpolation::Nearest));
-    trilinear.chain(nearest.filter(|_| pack.grids[0].record.class == 1))
+    trilinear.chain(nearest.filter(|_| pack.grids[0].is_level_set()))
 }
 
 /// Pixels that differ by more than `tolerance` of the larger, and the largest such difference.

@@ -7,6 +7,7 @@ use volpack::error::Error;
 use volpack::pack::{FrameReader, Pack, Region};
 use volpack::report::PackSummary;
 use volpack::settings::NonFinite;
+use volpack::stages::component::Component;
 use volpack::stages::flatten::flatten;
 use volpack::vdb::{Accessor, GridInfo, Value, VdbFile, with_scalar_type, with_value_type};
 use volpack::volume::Coord;
@@ -55,7 +56,7 @@ fn read_grid(file: &VdbFile, grid: &GridInfo) -> bool {
     if let Err(error) = values {
         return refused(&error);
     }
-    match flatten(file, Path::new("fuzz.vdb"), grid, NonFinite::Zero) {
+    match flatten(file, Path::new("fuzz.vdb"), grid, Component::Whole, NonFinite::Zero) {
         Ok(_) => true,
         Err(error) => refused::<Error>(&error),
     }

@@ -22,8 +22,8 @@ use crate::error::{Error, Result};
 use crate::pipeline::VerifyLevel;
 use crate::render::Device;
 use crate::settings::{
-    ByteSize, ClusterArgs, DEFAULT_ZSTD, Format, Masks, NonFinite, QualityArgs, RangeMode, Settings,
-    above_zero,
+    ByteSize, ClusterArgs, DEFAULT_ZSTD, Format, Integers, Masks, NonFinite, QualityArgs, RangeMode,
+    Settings, above_zero,
 };
 use crate::verify::PictureSettings;
 
@@ -108,6 +108,9 @@ struct SettingsArgs {
     /// What to do with infinities and NaNs [default: refuse]
     #[arg(long)]
     nonfinite: Option<NonFinite>,
+    /// What becomes of grids of integers [default: keep]
+    #[arg(long)]
+    integers: Option<Integers>,
     /// zstd level of the file, 0 to store everything raw [default: 3]
     #[arg(long, value_name = "LEVEL", value_parser = clap::value_parser!(i32).range(0..=22))]
     zstd: Option<i32>,
@@ -149,6 +152,7 @@ impl SettingsArgs {
             range: self.range.unwrap_or_default(),
             masks: self.masks.unwrap_or_default(),
             nonfinite: self.nonfinite.unwrap_or_default(),
+            integers: self.integers.unwrap_or_default(),
             zstd: self.zstd.unwrap_or(DEFAULT_ZSTD),
             fps: self.fps,
         })
@@ -163,6 +167,7 @@ impl SettingsArgs {
             || self.range.is_some()
             || self.masks.is_some()
             || self.nonfinite.is_some()
+            || self.integers.is_some()
             || self.zstd.is_some()
             || self.fps.is_some()
     }

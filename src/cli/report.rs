@@ -174,7 +174,7 @@ impl Gathering<'_> {
             }
             reporter.finish();
             reporter = Reporter::new(&format!("{name}, cheaper"), self.common.quiet);
-            match cheaper(job, &figures, &mut reporter) {
+            match cheaper(job, &pack, &figures, &mut reporter) {
                 Ok(cheaper) => Ok((outcome, pack, cheaper, None)),
                 Err(Error::Interrupted) => Err(Error::Interrupted),
                 // A size that cannot be reached is no offer.

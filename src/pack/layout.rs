@@ -164,13 +164,6 @@ pub struct GridRecord {
     pub codec_norms: [f32; 6],
 }
 
-impl GridRecord {
-    /// What PSNR is measured against: the range of the source's active values.
-    pub fn peak(&self) -> f64 {
-        f64::from(self.active_max) - f64::from(self.active_min)
-    }
-}
-
 /// One frame of one grid.
 #[derive(Clone, Copy, Debug, Pod, Zeroable)]
 #[repr(C)]

@@ -16,7 +16,8 @@ use super::tables::{chunk_range, read_tables};
 use super::{PackError, Provenance, check};
 use crate::codec::{Codec, SequenceRange};
 use crate::settings::Settings;
-use crate::volume::Coord;
+use crate::vdb::{GridClass, voxel_size};
+use crate::volume::{Coord, ValueRange};
 
 /// A section that is read whole may not grow more than this in decoding, so that a small file cannot
 /// take all memory. Trees shrink 2 to 10 times.
@@ -96,6 +97,23 @@ impl Grid {
     /// L1 nodes of a frame.
     pub(super) fn root_count(&self) -> usize {
         self.roots.iter().map(|r| *r as usize).product()
+    }
+
+    /// Whether its zero is a surface.
+    pub fn is_level_set(&self) -> bool {
+        self.record.class == GridClass::LevelSet as u32
+    }
+
+    /// What errors are measured against: see [`ValueRange::peak`].
+    pub fn peak(&self) -> f64 {
+        let active = ValueRange { min: self.record.active_min, max: self.record.active_max };
+        let has_active = self.frames.iter().any(|frame| frame.record.active_voxels > 0);
+        ValueRange::peak(has_active.then_some(active), self.background)
+    }
+
+    /// The smallest side of a voxel in any frame, in world units.
+    pub fn voxel_size(&self) -> f64 {
+        self.frames.iter().map(|frame| voxel_size(&frame.record.transform)).fold(f64::INFINITY, f64::min)
     }
 
     /// 128³ cells of an L1 node.

@@ -21,7 +21,7 @@ use crate::volume::{Blocks, Brick, FlatFrame};
 /// What frames pass through before anything is made of them.
 pub type Alter<'a> = &'a (dyn Fn(&mut FlatFrame) + Sync);
 
-const OUTLINE: Stage = Stage { name: "outline", version: 2, travels: false };
+const OUTLINE: Stage = Stage { name: "outline", version: 3, travels: false };
 
 /// One grid of one frame, with its voxels unless they were not needed so far.
 type Frame = (Outline, Option<Blocks<Brick>>);
@@ -148,11 +148,11 @@ fn flatten_grid(
     settings: &Settings,
 ) -> Result<Flattened> {
     // What the file says now may not be what it said when the grid was selected.
-    let info = find(&file.grids, &grid.name);
+    let info = find(&file.grids, &grid.source);
     let info = info.filter(|info| info.value_type.is_scalar()).ok_or_else(|| {
-        Error::Input(format!("{}: grid {:?} is gone: the file changed", frame.path.display(), grid.name))
+        Error::Input(format!("{}: grid {:?} is gone: the file changed", frame.path.display(), grid.source))
     })?;
-    flatten(file, &frame.path, info, settings.nonfinite)
+    flatten(file, &frame.path, info, grid.component, settings.nonfinite)
 }
 
 /// Reads the voxels of a grid's frames once more, for those whose outline alone is known.
@@ -171,9 +171,10 @@ fn fetch(sequence: &SequenceInfo, grid: &SelectedGrid, settings: &Settings, at_o
 
 /// What the outline of one grid of one frame depends on; `None` if the frame lacks the grid.
 fn key(frame: &FrameSource, grid: &SelectedGrid, settings: &Settings) -> Option<Key> {
-    let info = find(&frame.grids, &grid.name)?;
+    let info = find(&frame.grids, &grid.source)?;
     let policy = mask_policy(settings, grid.class);
-    Some(Key::new(&OUTLINE, &(frame.digest.as_bytes(), &info.name, settings.nonfinite, policy)))
+    let of_grid = (frame.digest.as_bytes(), &info.name, grid.component);
+    Some(Key::new(&OUTLINE, &(of_grid, settings.nonfinite, policy)))
 }
 
 /// For each grid, where what is made of its frames is kept.
@@ -222,13 +223,14 @@ fn grid_input(
 ) -> GridInput {
     let frames = grid.frames.iter().map(|&i| {
         let frame = &sequence.frames[i];
-        let info = find(&frame.grids, &grid.name).expect("the grid was selected in this frame");
+        let info = find(&frame.grids, &grid.source).expect("the grid was selected in this frame");
         let transform = info.transform.matrix.expect("the grid was selected for its linear map");
         FrameInput { number: frame.number, source: i as u32, transform }
     });
     GridInput {
         name: grid.name.clone(),
         class: grid.class,
+        is_integer: grid.is_integer,
         fps: settings.fps.unwrap_or(0.0),
         frames: frames.collect(),
         tree,

@@ -10,7 +10,8 @@ use rayon::prelude::*;
 use super::{Plan, Resources};
 use crate::error::{Error, Result};
 use crate::pack::Pack;
-use crate::stages::select::find;
+use crate::settings::Integers;
+use crate::stages::component::find_packed;
 use crate::units::bytes;
 use crate::vdb::{TreeSize, VdbFile};
 use crate::volume::{BRICK_VOXELS, Brick};
@@ -29,8 +30,8 @@ pub(super) fn frames_at_once(plan: &Plan, resources: &Resources) -> Result<usize
     let most = 2 * rayon::current_num_threads();
     let Some(limit) = resources.memory else { return Ok(most) };
     let files: Vec<&Path> = plan.sequence.frames.iter().map(|frame| &*frame.path).collect();
-    let grids: Vec<&str> = plan.selection.grids.iter().map(|grid| &*grid.name).collect();
-    let sizes = sizes(&files, &grids)?;
+    let grids: Vec<&str> = plan.selection.grids.iter().map(|grid| &*grid.source).collect();
+    let sizes = sizes(&files, &grids, Integers::Keep)?;
     let leaves: u64 = sizes.iter().map(|size| size.leaves).sum();
     Ok(at_once(limit, leaves * OF_A_LEAF, &files, &sizes)?.min(most))
 }
@@ -41,7 +42,8 @@ pub(super) fn compared_at_once(pack: &Pack, sources: &[PathBuf], resources: &Res
     let Some(limit) = resources.memory else { return Ok(most) };
     let files: Vec<&Path> = sources.iter().map(|path| &**path).collect();
     let grids: Vec<&str> = pack.grids.iter().map(|grid| &*grid.name).collect();
-    Ok(at_once(limit, size_of_val(&*pack.tree) as u64, &files, &sizes(&files, &grids)?)?.min(most))
+    let integers = pack.provenance.settings.integers;
+    Ok(at_once(limit, size_of_val(&*pack.tree) as u64, &files, &sizes(&files, &grids, integers)?)?.min(most))
 }
 
 /// How many of the largest file's frames fit beside what is kept.
@@ -65,11 +67,11 @@ fn at_once(limit: u64, kept: u64, files: &[&Path], sizes: &[TreeSize]) -> Result
 }
 
 /// For each file the trees of some grids together: they are read one after another, and kept until all are.
-fn sizes(files: &[&Path], grids: &[&str]) -> Result<Vec<TreeSize>> {
+fn sizes(files: &[&Path], grids: &[&str], integers: Integers) -> Result<Vec<TreeSize>> {
     let size = |path: &&Path| {
         let file = VdbFile::open(path).map_err(Error::vdb(path))?;
         let mut all = TreeSize::default();
-        for info in grids.iter().filter_map(|grid| find(&file.grids, grid)) {
+        for (info, _) in grids.iter().filter_map(|grid| find_packed(&file.grids, grid, integers)) {
             let size = file.tree_size(info).map_err(Error::vdb(path))?;
             all = TreeSize { leaves: all.leaves + size.leaves, bytes: all.bytes + size.bytes };
         }

@@ -15,7 +15,7 @@ use serde::Serialize;
 
 use crate::cache::{Cache, Uses};
 use crate::error::{Error, Result};
-use crate::pack::{FinishedPack, Pack, Provenance, Source};
+use crate::pack::{FinishedPack, Grid, Pack, Provenance, Source};
 use crate::report::PackSummary;
 pub use crate::report::model::Made;
 use crate::report::model::{BuildReport, StageSeconds};
@@ -177,13 +177,8 @@ fn build_cached(
     // Those of a build before that failed are not this one's.
     cache.map(|cache| cache.take_uses());
     let mut clock = Clock::new();
-    let (plan, warnings) = plan(job, progress)?;
-    for warning in &warnings {
-        if job.strict {
-            return Err(Error::Input(format!("{warning} (an error because of --strict)")));
-        }
-        progress.warn(warning);
-    }
+    let (plan, mut warnings) = plan(job, progress)?;
+    warn(job, &warnings, progress)?;
     clock.lap("metadata");
 
     let mut reuse = cache.map(|cache| Reuse::new(cache, &plan.provenance));
@@ -221,6 +216,9 @@ fn build_cached(
         return Err(Error::Misled("the pack under its key is another one".to_owned()));
     }
     clock.lap("verify");
+    let empty = empty_grids(&pack);
+    warn(job, &empty, progress)?;
+    warnings.extend(empty);
     let summary = PackSummary::new(&pack);
     // A mapped file cannot be renamed everywhere.
     drop(pack);
@@ -230,6 +228,22 @@ fn build_cached(
     let uses = cache.map(|cache| cache.take_uses()).unwrap_or_default();
     let seconds = clock.laps;
     Ok(Outcome { warnings, seconds, summary, verification, made, was_verified, cache: uses })
+}
+
+/// Tells what is odd, or ends a strict job by it.
+fn warn(job: &Job, warnings: &[String], progress: &mut dyn Progress) -> Result<()> {
+    if let Some(warning) = warnings.first().filter(|_| job.strict) {
+        return Err(Error::Input(format!("{warning} (an error because of --strict)")));
+    }
+    warnings.iter().for_each(|warning| progress.warn(warning));
+    Ok(())
+}
+
+/// A grid that was asked for and has nothing in any frame is likely another than was meant.
+fn empty_grids(pack: &Pack) -> Vec<String> {
+    let is_empty = |grid: &&Grid| grid.frames.iter().all(|frame| frame.record.active_voxels == 0);
+    let warning = |grid: &Grid| format!("grid {:?} has no active voxels in any frame", grid.name);
+    pack.grids.iter().filter(is_empty).map(warning).collect()
 }
 
 /// What a job comes to, as far as it can be told without a voxel.
@@ -248,7 +262,7 @@ fn plan(job: &Job, progress: &mut dyn Progress) -> Result<(Plan, Vec<String>)> {
     progress.stage("metadata", job.frames.len() as u64, "files");
     let digests = Digests { cache: job.cache.as_deref(), paranoid: job.paranoid };
     let sequence = metadata::read(&job.frames, digests)?;
-    let selection = select(&sequence, &job.settings.grids)?;
+    let selection = select(&sequence, &job.settings.grids, job.settings.integers)?;
     let warnings = [&sequence.warnings[..], &selection.warnings].concat();
     let provenance = provenance(&sequence, &job.settings);
     Ok((Plan { sequence, selection, provenance }, warnings))

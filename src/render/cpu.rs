@@ -12,7 +12,6 @@ use super::surface::{cubic, evaluate, first_change};
 use super::traverse::{Box3, MAX_CELL, Ray, Real, Walk};
 use super::{Interpolation, Mode, Traversal};
 use crate::pack::Grid;
-use crate::vdb::GridClass;
 use crate::volume::{Coord, CoordBox, ROOT_DIM};
 
 /// What is traced, and how it looks.
@@ -61,7 +60,7 @@ impl Scene {
             camera: view.camera(&bounds),
             size,
             matrix: grid.frames[frame].record.transform,
-            level_set: grid.record.class == GridClass::LevelSet as u32,
+            level_set: grid.is_level_set(),
             interpolation: Interpolation::default(),
             extinction: if depth > 0.0 { BOX_DEPTH / depth } else { 0.0 },
             threshold: HIT_DENSITY * densest,

@@ -28,7 +28,6 @@ pub use traverse::{Box3, Ray, Real, Walk};
 use clap::ValueEnum;
 
 use crate::pack::Grid;
-use crate::vdb::GridClass;
 
 /// What a picture shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -66,7 +65,7 @@ impl Mode {
 
     /// What shows a grid as people expect it.
     pub fn of_grid(grid: &Grid) -> Self {
-        if grid.record.class == GridClass::LevelSet as u32 { Self::Lit } else { Self::Density }
+        if grid.is_level_set() { Self::Lit } else { Self::Density }
     }
 
     /// Whether pixels are categories, which two tracers share or do not, rather than measures.

@@ -262,10 +262,10 @@ impl Checked<'_> {
     /// A setting of adaptive packs, and what it does not go with.
     fn adaptive(&self, setting: &str, would: &str) -> String {
         let settings = &self.pack.provenance.settings;
-        let asked = key(settings.quality);
+        let asked = key(settings.quality).filter(|asked| !setting.starts_with(asked));
         let format = if settings.format == Format::Adaptive { "" } else { "format = \"adaptive\" with " };
         let mut remedy = format!("{format}{setting} {would} meet it");
-        if settings.format == Format::Adaptive && !setting.starts_with(asked) {
+        if let Some(asked) = asked.filter(|_| settings.format == Format::Adaptive) {
             remedy += &format!(", in place of {asked}");
         }
         if settings.clustering.is_some() {
@@ -283,13 +283,14 @@ const COMPARE: &str = "build with --verify voxels";
 const NO_RANGE: &str = "all active values are one, so that there is no range to measure by";
 const USE_MAX_ERROR: &str = "limit max_error, in units";
 
-/// What a manifest calls it.
-fn key(quality: Quality) -> &'static str {
+/// What a manifest calls it; nothing where the manifest says nothing.
+fn key(quality: Quality) -> Option<&'static str> {
     match quality {
-        Quality::Psnr(_) => "psnr",
-        Quality::MaxError(_) => "max_error",
-        Quality::BitsPerVoxel(_) => "bits_per_voxel",
-        Quality::Size(_) => "size",
+        Quality::ByClass { .. } => None,
+        Quality::Psnr(_) => Some("psnr"),
+        Quality::MaxError(_) => Some("max_error"),
+        Quality::BitsPerVoxel(_) => Some("bits_per_voxel"),
+        Quality::Size(_) => Some("size"),
     }
 }
 

@@ -264,7 +264,7 @@ impl Figures {
         match psnr {
             Some(_) => crate::units::psnr(psnr),
             None if self.exact => "exact".to_owned(),
-            None if self.compared => "no range".to_owned(),
+            None if self.compared => "exact where active".to_owned(),
             None => "not compared".to_owned(),
         }
     }
@@ -277,7 +277,6 @@ impl Figures {
         build: Option<&BuildReport>,
     ) -> Self {
         let tree = summary.tree_bytes + summary.mask_bytes;
-        let of_range = |max: f64, peak: f64| if peak > 0.0 { max / peak } else { max };
         let largest = |all: &mut dyn Iterator<Item = f64>| all.fold(0.0, f64::max);
         // Where the ring found nothing to draw, nothing differs.
         let pictures = found.and_then(|found| found.pictures.as_ref());
@@ -293,11 +292,11 @@ impl Figures {
             bits_per_voxel: summary.bits_per_voxel,
             compared: found.is_some(),
             ok: found.is_none_or(|found| found.ok),
-            exact: found.is_some_and(|found| found.grids.iter().all(|grid| grid.active.max_error == 0.0)),
+            exact: found.is_some_and(|found| found.grids.iter().all(|grid| grid.all.max_error == 0.0)),
             psnr: found.and_then(|found| found.active.psnr),
             worst_frame_psnr: found.and_then(|found| found.worst_frame.as_ref()).map(|worst| worst.psnr),
             max_error: found
-                .map(|found| largest(&mut found.grids.iter().map(|g| of_range(g.active.max_error, g.peak)))),
+                .map(|found| largest(&mut found.grids.iter().map(|g| g.active.max_error / g.peak))),
             flip: pictures.map(|p| largest(&mut p.pictures.iter().map(|p| p.source.flip))),
             build_seconds: build.map(|build| build.seconds(None)),
         }

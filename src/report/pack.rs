@@ -118,11 +118,10 @@ impl PackSummary {
 fn squares_by_codec(pack: &Pack) -> [f64; 6] {
     let mut squares = [0.0; 6];
     for grid in &pack.grids {
-        let peak = grid.record.peak();
+        let peak = grid.peak();
         for (sum, norm) in squares.iter_mut().zip(grid.record.codec_norms) {
             let norm = f64::from(norm);
-            // Where all active values are one there is no range to measure by.
-            let relative = if peak > 0.0 { norm / peak } else { norm };
+            let relative = norm / peak;
             if relative.is_finite() {
                 *sum += relative * relative;
             }

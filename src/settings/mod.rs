@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 pub use budget::{Budget, Share};
 pub use clustering::{ClusterArgs, Clustering, Dedup, NOT_WITH_ADAPTIVE};
-pub use quality::{ByteSize, DEFAULT_PSNR, ErrorBound, FRAME_MARGIN_DB, Quality, QualityArgs, above_zero};
+pub use quality::{ByteSize, ErrorBound, FRAME_MARGIN_DB, Quality, QualityArgs, above_zero, whole_range};
 
 use crate::codec::Codec;
 
@@ -90,6 +90,26 @@ pub enum NonFinite {
     Zero,
 }
 
+/// What becomes of grids of integers.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
+#[serde(rename_all = "lowercase")]
+pub enum Integers {
+    /// Rounding a decoded value gives the integer: its error is below a half
+    #[default]
+    Keep,
+    /// Packed as several grids of 24 bits each (NAME.low, NAME.high) that together give every integer back exactly
+    Split,
+    /// Treated as any other numbers
+    Nearest,
+}
+
+impl Integers {
+    /// What packs were made with before there was a choice.
+    fn before_there_was_a_choice() -> Self {
+        Self::Nearest
+    }
+}
+
 /// The zstd level of a pack where none is chosen: the level of zstd's own tool.
 pub const DEFAULT_ZSTD: i32 = 3;
 
@@ -112,6 +132,9 @@ pub struct Settings {
     pub masks: Masks,
     /// What to do with infinities and NaNs.
     pub nonfinite: NonFinite,
+    /// What becomes of grids of integers.
+    #[serde(default = "Integers::before_there_was_a_choice")]
+    pub integers: Integers,
     /// zstd's level, 1 to 22; 0 stores everything raw.
     pub zstd: i32,
     /// Frames per second.
@@ -129,6 +152,7 @@ impl Default for Settings {
             range: RangeMode::default(),
             masks: Masks::default(),
             nonfinite: NonFinite::default(),
+            integers: Integers::default(),
             zstd: DEFAULT_ZSTD,
             fps: None,
         }

@@ -7,10 +7,13 @@ use clap::Args;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 use super::Format;
+use crate::vdb::GridClass;
 
-/// The PSNR of a pack for which nothing else is asked. The mean FLIP of nine real volumes' pictures is 0.0008 to 0.015
-/// there (docs/benchmarks/pictures.md): below what bc7 costs seven of them, and above it on smooth smoke.
-pub const DEFAULT_PSNR: f64 = 45.0;
+/// The PSNR of fog for which nothing is asked: smoke shows no blocks in its haze there, as it does at 45 dB
+/// (docs/benchmarks/sweep.md).
+const DEFAULT_PSNR: f64 = 55.0;
+/// The largest error of a level set for which nothing is asked: its surface shows no dents there.
+const DEFAULT_ERROR: ErrorBound = ErrorBound { value: 0.05, unit: ErrorUnit::Voxel };
 
 /// How far a frame's PSNR may lie below the whole sequence's: one bright frame must not erase late, thin
 /// smoke.
@@ -20,6 +23,13 @@ pub const FRAME_MARGIN_DB: f64 = 6.0;
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Quality {
+    /// What suits a grid by its class: the default, in full, since packs are verified by what they were asked for.
+    ByClass {
+        /// As [`Quality::Psnr`], for all but level sets.
+        psnr: f64,
+        /// As [`Quality::MaxError`], for level sets.
+        level_set_error: ErrorBound,
+    },
     /// Each grid's PSNR over active leaf voxels is at least this, in dB.
     Psnr(f64),
     /// No voxel is further from its source, on any GPU.
@@ -32,13 +42,36 @@ pub enum Quality {
 
 impl Default for Quality {
     fn default() -> Self {
-        Self::Psnr(DEFAULT_PSNR)
+        Self::ByClass { psnr: DEFAULT_PSNR, level_set_error: DEFAULT_ERROR }
+    }
+}
+
+impl Quality {
+    /// What is asked of a grid of a class whose errors are measured against `peak` and whose voxels are `voxel_size` wide,
+    /// both in the grid's units: never [`Quality::ByClass`].
+    pub fn of_grid(self, class: GridClass, peak: f64, voxel_size: f64) -> Self {
+        match self {
+            // A level set whose values span less than a voxel is none whose distances are in world units.
+            Self::ByClass { level_set_error, .. } if class == GridClass::LevelSet && peak > voxel_size => {
+                Self::MaxError(level_set_error)
+            }
+            Self::ByClass { psnr, .. } => Self::Psnr(psnr),
+            asked => asked,
+        }
+    }
+
+    /// Whether it is bytes that are asked for, one way or another.
+    pub fn is_size(self) -> bool {
+        matches!(self, Self::BitsPerVoxel(_) | Self::Size(_))
     }
 }
 
 impl fmt::Display for Quality {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
+            Self::ByClass { psnr, level_set_error } => {
+                write!(f, "psnr {psnr}, of level sets max-error {level_set_error}")
+            }
             Self::Psnr(db) => write!(f, "psnr {db}"),
             Self::MaxError(bound) => write!(f, "max-error {bound}"),
             Self::BitsPerVoxel(bits) => write!(f, "bits-per-voxel {bits}"),
@@ -157,7 +190,7 @@ impl FromStr for ByteSize {
 /// The settings of which an adaptive pack has one, and its floor for single frames.
 #[derive(Args, Clone, Debug, Default, PartialEq)]
 pub struct QualityArgs {
-    /// Adaptive: the PSNR over active voxels to reach, in dB [default: 45]
+    /// Adaptive: the PSNR over active voxels to reach, in dB [default: 55; for level sets --max-error "0.05 voxels"]
     #[arg(long, value_name = "DB", value_parser = decibels, group = "quality")]
     pub psnr: Option<f64>,
     /// Adaptive: the error that no voxel exceeds on any GPU: 0.01 or 1% of the range, "0.2 units", "0.1 voxels"
@@ -214,6 +247,9 @@ impl QualityArgs {
         }
         let bits = self.bits_per_voxel.map_or(Ok(0.0), check_above_zero);
         bits.map_err(|e| format!("bits_per_voxel: {e}"))?;
+        if let Some(bound) = self.max_error.filter(|bound| bound.fraction().is_some_and(|part| part >= 1.0)) {
+            return Err(whole_range(bound, 1.0, 1.0));
+        }
         if self.max_error.is_some() && self.min_frame_psnr.is_some() {
             return Err("max_error holds for every voxel of every frame: min_frame_psnr does not go with it"
                 .to_owned());
@@ -230,6 +266,17 @@ impl QualityArgs {
             (quality, None) => Ok(quality.unwrap_or_default()),
         }
     }
+}
+
+/// Why an error bound that is the whole range of values or more is refused, for a grid whose values span `peak` and whose
+/// voxels are `voxel_size` wide.
+pub fn whole_range(bound: ErrorBound, peak: f64, voxel_size: f64) -> String {
+    let meant = match bound.fraction() {
+        Some(fraction) if fraction < 100.0 => format!(": for {fraction} % of it write \"{fraction}%\""),
+        Some(_) => String::new(),
+        None => format!(": it is {} of {peak} units", bound.absolute(peak, voxel_size)),
+    };
+    format!("max_error {bound} is the whole range of values or more, and would keep nothing of them{meant}")
 }
 
 /// Reads what `FromStr` reads, and plain numbers too.

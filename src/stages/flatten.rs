@@ -4,6 +4,7 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 use crate::settings::NonFinite;
+use crate::stages::component::Component;
 use crate::vdb::{GridInfo, LEAVES_IN_BLOCK, Scalar, Tree, VdbFile, with_scalar_type};
 use crate::volume::{
     BRICK_VOXELS, Brick, CELL_DIM, Cell, CellContent, Child, Constant, Coord, FlatFrame, FrameStats, Mask512,
@@ -18,7 +19,7 @@ pub struct Flattened {
     pub background: f32,
 }
 
-/// Reads one grid of an open file and flattens it. Values that are not `f32` become the nearest one.
+/// Reads one grid of an open file and flattens what is to be packed of its values. What is not `f32` becomes the nearest one.
 ///
 /// # Errors
 /// When the tree cannot be read, or has infinities or NaNs and `nonfinite` refuses them.
@@ -26,10 +27,11 @@ pub fn flatten(
     file: &VdbFile,
     path: &std::path::Path,
     grid: &GridInfo,
+    component: Component,
     nonfinite: NonFinite,
 ) -> Result<Flattened> {
     let flat = with_scalar_type!(&grid.value_type,
-        T => flatten_tree(file.read_tree::<T>(grid).map_err(Error::vdb(path))?, nonfinite),
+        T => flatten_tree(file.read_tree::<T>(grid).map_err(Error::vdb(path))?, Reading { component, nonfinite }),
         other => unreachable!("{} grids are refused when grids are selected", other.name())
     );
     let count = flat.frame.stats.nonfinite;
@@ -57,18 +59,46 @@ struct LeafSummary {
     kind: LeafKind,
     active_range: Option<ValueRange>,
     nonfinite: u64,
+    rounding: f64,
 }
 
-fn flatten_tree<T: Scalar>(mut tree: Tree<T>, nonfinite: NonFinite) -> Flattened {
-    let mut f = Flattener { background: 0.0, nonfinite_count: 0, nonfinite, active_range: None };
-    f.background = f.value(tree.background);
+/// How values are read.
+#[derive(Clone, Copy)]
+struct Reading {
+    component: Component,
+    nonfinite: NonFinite,
+}
+
+impl Reading {
+    fn finite(self, value: f32) -> f32 {
+        if value.is_finite() || self.nonfinite == NonFinite::Refuse { value } else { 0.0 }
+    }
+
+    /// How far the nearest `f32` is from a value.
+    fn rounding<T: Scalar>(self, value: T) -> f64 {
+        if T::FITS_F32 {
+            return 0.0;
+        }
+        let error = self.component.error_of(value, self.component.to_f32(value)).abs();
+        if error.is_finite() { error } else { 0.0 }
+    }
+}
+
+/// An inactive value: 0 and -0 are one background.
+fn inactive(value: f32) -> f32 {
+    value + 0.0
+}
+
+fn flatten_tree<T: Scalar>(mut tree: Tree<T>, reading: Reading) -> Flattened {
+    let mut f = Flattener { background: 0.0, reading, nonfinite_count: 0, rounding: 0.0, active_range: None };
+    f.background = inactive(f.value(tree.background));
     let background = f.background;
 
     // A block of leaves is gone as soon as its bricks are made.
     let blocks = std::mem::take(&mut tree.leaves.blocks).into_par_iter();
     let (summaries, bricks): (Vec<Vec<LeafSummary>>, Vec<Vec<Brick>>) = blocks
         .zip(tree.leaves.masks.par_chunks(LEAVES_IN_BLOCK))
-        .map(|(values, masks)| bricks(values, masks, background, nonfinite))
+        .map(|(values, masks)| bricks(values, masks, background, reading))
         .unzip();
     let summaries: Vec<LeafSummary> = summaries.into_iter().flatten().collect();
 
@@ -101,6 +131,7 @@ fn flatten_tree<T: Scalar>(mut tree: Tree<T>, nonfinite: NonFinite) -> Flattened
         bbox: topology.bbox,
         active_range: ValueRange::union_all(leaf_range.into_iter().chain(f.active_range)),
         nonfinite: f.nonfinite_count + summaries.iter().map(|s| s.nonfinite).sum::<u64>(),
+        rounding: summaries.iter().map(|s| s.rounding).fold(f.rounding, f64::max),
     };
     // A file may list its root entries in any order, and cells are numbered within one entry.
     let mut frame = FlatFrame { roots, cells, bricks: bricks.into(), stats };
@@ -110,21 +141,24 @@ fn flatten_tree<T: Scalar>(mut tree: Tree<T>, nonfinite: NonFinite) -> Flattened
 
 struct Flattener {
     background: f32,
-    nonfinite: NonFinite,
+    reading: Reading,
     nonfinite_count: u64,
+    rounding: f64,
     active_range: Option<ValueRange>,
 }
 
 impl Flattener {
     fn value<T: Scalar>(&mut self, value: T) -> f32 {
-        let value = value.to_f32();
+        self.rounding = self.rounding.max(self.reading.rounding(value));
+        let value = self.reading.component.to_f32(value);
         self.nonfinite_count += u64::from(!value.is_finite());
-        finite(value, self.nonfinite)
+        self.reading.finite(value)
     }
 
     /// A tile as a constant region, unless it is inactive background.
     fn tile<T: Scalar>(&mut self, value: T, active: bool) -> Option<Constant> {
         let value = self.value(value);
+        let value = if active { value } else { inactive(value) };
         if active {
             self.active_range =
                 ValueRange::union_all(self.active_range.into_iter().chain([ValueRange::of(value)]));
@@ -162,27 +196,29 @@ impl Flattener {
     }
 }
 
-fn finite(value: f32, nonfinite: NonFinite) -> f32 {
-    if value.is_finite() || nonfinite == NonFinite::Refuse { value } else { 0.0 }
-}
-
 /// What becomes of a block of leaves, and those that are bricks.
 fn bricks<T: Scalar>(
     values: Vec<T>,
     masks: &[Mask512],
     background: f32,
-    nonfinite: NonFinite,
+    reading: Reading,
 ) -> (Vec<LeafSummary>, Vec<Brick>) {
     let mut bricks = Vec::with_capacity(masks.len());
     let leaves = values.as_chunks::<BRICK_VOXELS>().0.iter().zip(masks);
     let summary = |(values, &active): (&[T; BRICK_VOXELS], &Mask512)| {
         // Made where it stays if it is one: copying it costs as much as looking at it.
-        let values = std::array::from_fn(|i| values[i].to_f32());
+        let rounding = values.iter().map(|v| reading.rounding(*v)).fold(0.0, f64::max);
+        let values = std::array::from_fn(|i| reading.component.to_f32(values[i]));
         bricks.push(Brick { values, active, keeps_mask: true });
         let brick = bricks.last_mut().expect("one was pushed");
         let odd = brick.values.iter().filter(|v| !v.is_finite()).count() as u64;
         if odd > 0 {
-            brick.values.iter_mut().for_each(|v| *v = finite(*v, nonfinite));
+            brick.values.iter_mut().for_each(|v| *v = reading.finite(*v));
+        }
+        if background == 0.0 {
+            (0..BRICK_VOXELS)
+                .filter(|&i| !active.get(i))
+                .for_each(|i| brick.values[i] = inactive(brick.values[i]));
         }
         let active_range = brick.range_over(&active).map(|(min, max)| ValueRange { min, max });
         let kind = match brick.constant() {
@@ -193,7 +229,7 @@ fn bricks<T: Scalar>(
         if !matches!(kind, LeafKind::Brick) {
             bricks.pop();
         }
-        LeafSummary { kind, active_range, nonfinite: odd }
+        LeafSummary { kind, active_range, nonfinite: odd, rounding }
     };
     let summaries = leaves.map(summary).collect();
     (summaries, bricks)

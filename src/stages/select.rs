@@ -1,6 +1,8 @@
 //! Stage 2: choose the grids, check that all frames agree.
 
 use crate::error::{Error, Result};
+use crate::settings::Integers;
+use crate::stages::component::{Component, packed_as};
 use crate::stages::metadata::SequenceInfo;
 use crate::vdb::{GridClass, GridInfo};
 
@@ -19,8 +21,14 @@ pub struct Selection {
 /// One grid and the frames that have it.
 #[derive(Clone, Debug)]
 pub struct SelectedGrid {
-    /// Its name.
+    /// Its name in the pack.
     pub name: String,
+    /// Its name in the files.
+    pub source: String,
+    /// What of its values is packed.
+    pub component: Component,
+    /// Whether its values are integers.
+    pub is_integer: bool,
     /// What kind of field it holds.
     pub class: GridClass,
     /// The frames, by their place in the sequence, in which it exists.
@@ -31,14 +39,24 @@ pub struct SelectedGrid {
 ///
 /// # Errors
 /// A grid that no frame has, that cannot be packed, or whose frames disagree about what it is.
-pub fn select(sequence: &SequenceInfo, names: &[String]) -> Result<Selection> {
+pub fn select(sequence: &SequenceInfo, names: &[String], integers: Integers) -> Result<Selection> {
     let names = if names.is_empty() { vec![default_grid(sequence)?] } else { names.to_vec() };
     let mut selection = Selection { grids: Vec::new(), warnings: Vec::new() };
     for (i, name) in names.iter().enumerate() {
         if names[..i].contains(name) {
             return Err(Error::Usage(format!("grid {name:?} is asked for twice")));
         }
-        selection.grids.push(select_one(sequence, name, &mut selection.warnings)?);
+        let whole = select_one(sequence, name, &mut selection.warnings)?;
+        let first =
+            find(&sequence.frames[whole.frames[0]].grids, name).expect("it was selected in this frame");
+        for (name, component) in packed_as(first, integers) {
+            if selection.grids.iter().any(|grid| grid.name == name) {
+                return Err(Error::Usage(format!(
+                    "two grids of the pack would be {name:?}: choose one of them"
+                )));
+            }
+            selection.grids.push(SelectedGrid { name, component, ..whole.clone() });
+        }
     }
     Ok(selection)
 }
@@ -77,7 +95,15 @@ fn default_grid(sequence: &SequenceInfo) -> Result<String> {
 }
 
 fn select_one(sequence: &SequenceInfo, name: &str, warnings: &mut Vec<String>) -> Result<SelectedGrid> {
-    let mut selected = SelectedGrid { name: name.to_owned(), class: GridClass::Unknown, frames: Vec::new() };
+    let mut selected = SelectedGrid {
+        name: name.to_owned(),
+        source: name.to_owned(),
+        component: Component::Whole,
+        is_integer: false,
+        class: GridClass::Unknown,
+        frames: Vec::new(),
+    };
+    let mut first: Option<&GridInfo> = None;
     let mut missing = Vec::new();
     for (i, frame) in sequence.frames.iter().enumerate() {
         let Some(grid) = find(&frame.grids, name) else {
@@ -101,6 +127,18 @@ fn select_one(sequence: &SequenceInfo, name: &str, warnings: &mut Vec<String>) -
                 grid.transform.map
             ));
         }
+        let before = first.get_or_insert(grid);
+        if grid.value_type.is_integer() != before.value_type.is_integer()
+            || grid.value_type.is_integer() && grid.value_type != before.value_type
+        {
+            return Err(Error::Input(format!(
+                "{}: grid {name:?} is {} here and {} in an earlier frame",
+                frame.path.display(),
+                grid.value_type.name(),
+                before.value_type.name()
+            )));
+        }
+        selected.is_integer = grid.value_type.is_integer();
         match (selected.class, grid.class) {
             (GridClass::Unknown, class) => selected.class = class,
             (_, GridClass::Unknown) => {}

@@ -1,10 +1,10 @@
 //! The nearest cheaper setting of a pack, built and compared.
 
 use crate::error::{Error, Result};
-use crate::pack::Pack;
+use crate::pack::{Grid, Pack};
 use crate::pipeline::{Job, Progress, VerifyLevel, build};
 use crate::report::model::{Cheaper, Figures};
-use crate::settings::{Format, Quality, Settings};
+use crate::settings::{ErrorBound, Format, Quality, Settings};
 
 /// A step down: half a bit a voxel on fog, too little to see from one to the next.
 const STEP_DB: f64 = 3.0;
@@ -18,9 +18,15 @@ const FINEST_DB: f64 = 60.0;
 ///
 /// # Errors
 /// As [`build`].
-pub fn cheaper(job: &Job, figures: &Figures, progress: &mut dyn Progress) -> Result<Option<Cheaper>> {
+pub fn cheaper(
+    job: &Job,
+    pack: &Pack,
+    figures: &Figures,
+    progress: &mut dyn Progress,
+) -> Result<Option<Cheaper>> {
     let most = figures.gpu_bytes;
-    let Some((setting, settings)) = next(&job.settings, figures) else { return Ok(None) };
+    let only_level_sets = pack.grids.iter().all(Grid::is_level_set);
+    let Some((setting, settings)) = next(&job.settings, figures, only_level_sets) else { return Ok(None) };
     let folder = tempfile::tempdir().map_err(Error::io(std::env::temp_dir()))?;
     let mut job = job.clone();
     job.output = folder.path().join("cheaper.volpack");
@@ -35,13 +41,14 @@ pub fn cheaper(job: &Job, figures: &Figures, progress: &mut dyn Progress) -> Res
 }
 
 /// The next setting down, as a manifest has it.
-fn next(settings: &Settings, figures: &Figures) -> Option<(String, Settings)> {
+fn next(settings: &Settings, figures: &Figures, only_level_sets: bool) -> Option<(String, Settings)> {
     let (text, quality) = match (settings.format, settings.quality) {
-        (Format::Adaptive, Quality::Psnr(db)) => psnr(db - STEP_DB)?,
-        (Format::Adaptive, Quality::MaxError(bound)) => {
-            let twice = bound.times(2.0);
-            (format!("max_error = \"{twice}\""), Quality::MaxError(twice))
+        // What suits fog does not suit level sets: a pack that has both goes by what its fog is asked for.
+        (Format::Adaptive, Quality::ByClass { level_set_error, .. }) if only_level_sets => {
+            max_error(level_set_error)
         }
+        (Format::Adaptive, Quality::Psnr(db) | Quality::ByClass { psnr: db, .. }) => psnr(db - STEP_DB)?,
+        (Format::Adaptive, Quality::MaxError(bound)) => max_error(bound),
         (Format::Adaptive, Quality::BitsPerVoxel(bits)) => {
             let bits = bits * STEP_SIZE;
             (format!("bits_per_voxel = {bits}"), Quality::BitsPerVoxel(bits))
@@ -58,6 +65,11 @@ fn next(settings: &Settings, figures: &Figures) -> Option<(String, Settings)> {
     let dedup = if settings.clustering.is_some() { ", no dedup" } else { "" };
     let settings = Settings { format: Format::Adaptive, quality, clustering: None, ..settings.clone() };
     Some((format!("{format}{text}{dedup}"), settings))
+}
+
+fn max_error(bound: ErrorBound) -> (String, Quality) {
+    let twice = bound.times(2.0);
+    (format!("max_error = \"{twice}\""), Quality::MaxError(twice))
 }
 
 fn psnr(db: f64) -> Option<(String, Quality)> {

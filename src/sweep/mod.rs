@@ -14,7 +14,7 @@ use serde::Serialize;
 use crate::error::{Error, Result};
 use crate::pipeline::{Job, Progress, VerifyLevel};
 use crate::report::chart::{self, Point, Spread};
-use crate::settings::{Clustering, ErrorBound, Format, NonFinite, Quality, RangeMode, Settings};
+use crate::settings::{Clustering, ErrorBound, Format, Integers, NonFinite, Quality, RangeMode, Settings};
 
 pub use cheaper::cheaper;
 pub use field::{Difference, Jumps};
@@ -97,6 +97,8 @@ impl Options {
             grids: self.grid.iter().cloned().collect(),
             format,
             nonfinite: self.nonfinite,
+            // Codecs are compared, those too that do not keep integers.
+            integers: Integers::Nearest,
             // What is compared is what a GPU holds; the file's own compression would blur the times.
             zstd: 0,
             ..Settings::default()
@@ -118,6 +120,7 @@ impl Options {
         let settings = Settings { quality, ..self.settings(Format::Adaptive) };
         let (method, setting) = match quality {
             Quality::Psnr(db) => ("adaptive", format!("psnr = {db}")),
+            Quality::ByClass { .. } => ("adaptive", "default".to_owned()),
             other => ("adaptive max-error", other.to_string().replacen("max-error ", "max error = ", 1)),
         };
         Method { method, setting, settings }

@@ -13,11 +13,13 @@ use crate::render::gpu::Gpu;
 use crate::render::{Mode, Scene, View};
 use crate::report::PackSummary;
 use crate::report::chart::Point;
-use crate::stages::flatten::flatten;
+use crate::settings::Integers;
+use crate::stages::component::Component;
+use crate::stages::flatten::{Flattened, flatten};
 use crate::stages::select::find;
-use crate::vdb::{Accessor, GridClass, GridInfo, Tree, VdbFile, with_scalar_type};
+use crate::vdb::{Accessor, GridInfo, Tree, VdbFile, with_scalar_type};
 use crate::verify::{self, Sources};
-use crate::volume::{Coord, FlatFrame, ValueRange};
+use crate::volume::{Coord, ValueRange};
 
 /// Tolerances of NanoVDB's FpN, as fractions of the range of values.
 const FPN: [f64; 6] = [0.1, 0.05, 0.02, 0.01, 0.005, 0.002];
@@ -78,13 +80,19 @@ impl Source {
         let sequence =
             crate::stages::metadata::read(&options.frames, crate::stages::metadata::Digests::default())?;
         let grids: Vec<String> = options.grid.iter().cloned().collect();
-        let selection = crate::stages::select::select(&sequence, &grids)?;
+        let selection = crate::stages::select::select(&sequence, &grids, Integers::Nearest)?;
         let grid = selection.grids[0].name.clone();
         // Blockiness is measured where pictures are taken.
         let shown = verify::shown_frames(sequence.frames.len());
-        let (mut range, mut jumps, mut kept) = (None, Jumps::default(), Vec::new());
+        let (mut range, mut background) = (None, 0.0);
+        let (mut jumps, mut kept) = (Jumps::default(), Vec::new());
         for (i, frame) in sequence.frames.iter().enumerate() {
-            let Some(flat) = flat_frame(&frame.path, &grid, options)? else { continue };
+            let Some(Flattened { frame: flat, background: outside }) =
+                flat_frame(&frame.path, &grid, options)?
+            else {
+                continue;
+            };
+            background = outside;
             range = ValueRange::union_all(range.into_iter().chain(flat.stats.active_range));
             if shown.contains(&i) {
                 let bricks = Bricks::of_source(&flat);
@@ -92,16 +100,16 @@ impl Source {
                 kept.push((i, bricks));
             }
         }
-        let peak = range.map_or(0.0, ValueRange::width);
+        let peak = ValueRange::peak(range, background);
         Ok(Self { grid, peak, shown: kept, jumps })
     }
 }
 
 /// One frame of the source; `None` if it lacks the grid.
-pub(super) fn flat_frame(path: &Path, grid: &str, options: &Options) -> Result<Option<FlatFrame>> {
+pub(super) fn flat_frame(path: &Path, grid: &str, options: &Options) -> Result<Option<Flattened>> {
     let file = VdbFile::open(path).map_err(Error::vdb(path))?;
     let Some(info) = find(&file.grids, grid) else { return Ok(None) };
-    Ok(Some(flatten(&file, path, info, options.nonfinite)?.frame))
+    Ok(Some(flatten(&file, path, info, Component::Whole, options.nonfinite)?))
 }
 
 fn point(
@@ -143,7 +151,7 @@ fn point(
         gpu_bytes: summary.gpu_bytes,
         bits_per_voxel: summary.bits_per_voxel,
         psnr: grid.active.psnr,
-        max_error: if grid.peak > 0.0 { grid.active.max_error / grid.peak } else { 0.0 },
+        max_error: grid.active.max_error / grid.peak,
         build_seconds: seconds,
         trace_ms,
         blockiness: Some(jumps.blockiness(&source.jumps)).filter(|b| b.is_finite()),
@@ -160,7 +168,7 @@ fn trace(gpu: &Gpu, pack: &Pack, size: [u32; 2], repeats: u32) -> Option<f64> {
     let grid = &pack.grids[0];
     let frame = grid.frames.len() - 1;
     let bounds = pack.frame_tree(0, frame).bounds();
-    let mode = if grid.record.class == GridClass::LevelSet as u32 { Mode::Depth } else { Mode::Density };
+    let mode = if grid.is_level_set() { Mode::Depth } else { Mode::Density };
     let scene = Scene::new(grid, frame, &View::default(), mode, size);
     let median = |repeats| {
         let (_, mut ms) = gpu.trace_timed(&uploaded, [0, frame as u32], bounds, &scene, repeats).ok()?;

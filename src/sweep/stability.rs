@@ -11,7 +11,8 @@ use crate::pack::Pack;
 use crate::pipeline::{Progress, Silent, build_altered};
 use crate::report::PackSummary;
 use crate::report::chart::Spread;
-use crate::settings::{Clustering, Format, Quality, Settings};
+use crate::settings::{Clustering, Format, Integers, Quality, Settings};
+use crate::stages::flatten::Flattened;
 use crate::stages::metadata;
 use crate::stages::select::select;
 use crate::volume::ValueRange;
@@ -70,6 +71,7 @@ pub fn stability(options: &Options, methods: &[Method], progress: &mut dyn Progr
     select(
         &metadata::read(&options.frames, metadata::Digests::default())?,
         &options.grid.iter().cloned().collect::<Vec<_>>(),
+        Integers::Nearest,
     )?;
     let (spreads, skipped) = each(methods, progress, |method| spread(options, method, scratch.path()))?;
     Ok(Stability { spreads, skipped })
@@ -146,7 +148,9 @@ fn run(options: &Options, method: &Method, variation: Variation, folder: &Path) 
         let name = &pack.provenance.sources[frame.record.source as usize].file;
         let path = frames.iter().find(|p| p.file_name().is_some_and(|n| n == name.as_str()));
         let path = path.ok_or_else(|| Error::Other(format!("{name} is not among the files")))?;
-        let Some(mut flat) = flat_frame(path, &grid.name, options)? else { continue };
+        let Some(Flattened { frame: mut flat, .. }) = flat_frame(path, &grid.name, options)? else {
+            continue;
+        };
         alter(&mut flat);
         range = ValueRange::union_all(range.into_iter().chain(flat.stats.active_range));
         let source = Bricks::of_source(&flat);
@@ -158,11 +162,11 @@ fn run(options: &Options, method: &Method, variation: Variation, folder: &Path) 
         jumps[0].add(&source.jumps());
         jumps[1].add(&packed.jumps());
     }
-    let peak = range.map_or(0.0, ValueRange::width);
+    let peak = ValueRange::peak(range, grid.background);
     Ok(Run {
         psnr: difference.psnr(peak).unwrap_or(f64::INFINITY),
         bits_per_voxel: PackSummary::new(&pack).bits_per_voxel,
-        max_error: if peak > 0.0 { difference.max / peak } else { 0.0 },
+        max_error: difference.max / peak,
         jumps,
         digest: blake3::hash(&bytes),
         variation,

@@ -61,6 +61,11 @@ impl ValueType {
         matches!(self, Self::Float | Self::Double | Self::Int32 | Self::Int64)
     }
 
+    /// Whether its values are integers that can be packed.
+    pub fn is_integer(&self) -> bool {
+        matches!(self, Self::Int32 | Self::Int64)
+    }
+
     /// Whether a leaf's buffer is a second bit mask instead of 512 values (OpenVDB's
     /// `LeafNode<bool>` and `LeafNode<ValueMask>`).
     pub(super) fn has_bit_leaves(&self) -> bool {
@@ -89,14 +94,25 @@ pub trait Value: Copy + Default + PartialEq + Send + Sync + std::fmt::Debug + 's
 
 /// A [`Value`] that can be packed.
 pub trait Scalar: Value + PartialOrd {
+    /// Whether an `f32` holds every value.
+    const FITS_F32: bool = false;
+
     /// The nearest `f32`: exact for `f32` itself.
     fn to_f32(self) -> f32;
     /// The nearest `f64`: exact for all but large `i64`.
     fn to_f64(self) -> f64;
+    /// How far a decoded value is from this one; 0 only where they are equal.
+    fn error_of(self, decoded: f32) -> f64 {
+        f64::from(decoded) - self.to_f64()
+    }
+    /// An integer as a whole number; 0 for what is none.
+    fn to_integer(self) -> i64 {
+        0
+    }
 }
 
 macro_rules! scalar {
-    ($t:ty, $negative:expr $(, half = $half:expr)?) => {
+    ($t:ty, $negative:expr $(, half = $half:expr)? $(, fits_f32 = $fits:literal)? $(, integer = $to_integer:expr)?) => {
         impl Value for $t {
             const SIZE: usize = size_of::<$t>();
             $(const HALF_SIZE: usize = 2;
@@ -118,6 +134,20 @@ macro_rules! scalar {
             }
         }
         impl Scalar for $t {
+            $(const FITS_F32: bool = $fits;)?
+            $(fn to_integer(self) -> i64 {
+                let to_integer: fn($t) -> i64 = $to_integer;
+                to_integer(self)
+            }
+            fn error_of(self, decoded: f32) -> f64 {
+                let decoded = f64::from(decoded);
+                // A whole number of an f64 has few bits: an i128 holds it and the difference.
+                if decoded.fract() == 0.0 && decoded.abs() < 1e38 {
+                    (decoded as i128 - i128::from(self)) as f64
+                } else {
+                    decoded - self as f64
+                }
+            })?
             #[inline]
             fn to_f32(self) -> f32 {
                 self as f32
@@ -130,10 +160,10 @@ macro_rules! scalar {
     };
 }
 
-scalar!(f32, |v| -v, half = f16::to_f32);
+scalar!(f32, |v| -v, half = f16::to_f32, fits_f32 = true);
 scalar!(f64, |v| -v, half = f16::to_f64);
-scalar!(i32, i32::wrapping_neg);
-scalar!(i64, i64::wrapping_neg);
+scalar!(i32, i32::wrapping_neg, integer = i64::from);
+scalar!(i64, i64::wrapping_neg, integer = |v| v);
 
 impl Value for bool {
     const SIZE: usize = 1;

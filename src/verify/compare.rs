@@ -2,17 +2,18 @@
 
 use rayon::prelude::*;
 
+use super::promise::Promise;
 use crate::codec::{BrickRange, Codec};
 use crate::pack::{FrameReader, Region};
-use crate::settings::{Format, Masks, NonFinite, Quality, Settings};
-use crate::vdb::{GridClass, GridInfo, Internal, Scalar, Tree, voxel_size};
+use crate::settings::{Format, Masks, NonFinite};
+use crate::stages::component::Component;
+use crate::vdb::{GridInfo, Internal, Scalar, Tree};
 use crate::volume::{
     BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, InactiveRule, Mask512, ROOT_DIM, ValueRange,
 };
 
-/// A level set's sign may flip where the surface is nearer than this many voxels: there the sign is
-/// within what any quantisation of the distance moves the surface by.
-pub const SIGN_MATTERS_VOXELS: f64 = 0.1;
+/// Codecs, constants among them, by their tags.
+pub(super) const CODECS: usize = Codec::WITH_TEXELS.len() + 1;
 
 /// Squared errors of some voxels.
 #[derive(Clone, Copy, Debug, Default)]
@@ -34,7 +35,8 @@ impl Error {
     fn voxel(&mut self, error: f64, flipped: bool) {
         self.voxels += 1;
         self.squares += error * error;
-        self.max = self.max.max(error.abs());
+        // What is no number is no small error.
+        self.max = if error.is_nan() { f64::INFINITY } else { self.max.max(error.abs()) };
         self.sign_flips += u64::from(flipped);
     }
 }
@@ -58,16 +60,23 @@ fn bin(error: f64) -> usize {
 /// What differs in one frame.
 #[derive(Clone, Debug, Default)]
 pub(super) struct FrameError {
-    /// Over active leaf voxels.
+    /// Over active leaf voxels, in the source's own type.
     pub active: Error,
-    /// Over all leaf voxels.
+    /// The same over all leaf voxels.
     pub all: Error,
     /// Of active leaf voxels.
     pub histogram: Histogram,
     /// The range of the source's active values, tiles included.
     pub active_range: Option<ValueRange>,
-    /// Squared error over the voxels that texels give.
-    texel_squares: f64,
+    /// Active voxels of the source, tiles in full.
+    pub active_voxels: u64,
+    /// Whether the pack has anything but background.
+    pub has_regions: bool,
+    /// Squared error over the voxels that texels give, by the codec that gives them, against the nearest floats of the
+    /// source: what the encoder saw.
+    pub codec_squares: [f64; CODECS],
+    /// Squared error over active leaf voxels, likewise.
+    pub active_float_squares: f64,
     failures: u64,
     first_failure: Option<String>,
 }
@@ -82,7 +91,8 @@ impl FrameError {
         self.active.add(&other.active);
         self.all.add(&other.all);
         self.histogram.iter_mut().zip(other.histogram).for_each(|(sum, count)| *sum += count);
-        self.texel_squares += other.texel_squares;
+        self.codec_squares.iter_mut().zip(other.codec_squares).for_each(|(sum, squares)| *sum += squares);
+        self.active_float_squares += other.active_float_squares;
         self.active_range = ValueRange::union_all(self.active_range.into_iter().chain(other.active_range));
         self.failures += other.failures;
         self.first_failure = self.first_failure.take().or(other.first_failure);
@@ -102,41 +112,15 @@ impl FrameError {
     }
 }
 
-struct Comparison<'a, T> {
-    tree: &'a Tree<T>,
-    reader: &'a FrameReader<'a>,
-    settings: &'a Settings,
-    /// The range of the source's active values, as the pack has it.
-    peak: f64,
-    /// The error that no voxel may have on any GPU, if that was promised.
-    max_error: Option<f64>,
-    /// The distance above which a level set's sign counts; `None` for other grids.
-    sign_matters: Option<f64>,
-}
-
+/// Compares a frame of a pack with the tree that it was made from.
 pub(super) fn compare<T: Scalar>(
     tree: &Tree<T>,
     info: &GridInfo,
+    component: Component,
     reader: &FrameReader,
-    settings: &Settings,
+    promise: &Promise,
 ) -> FrameError {
-    let voxel_size = info.transform.matrix.as_ref().map_or(1.0, voxel_size);
-    let peak = reader.grid().record.peak();
-    let max_error = match settings.quality {
-        Quality::MaxError(bound) if settings.format == Format::Adaptive => {
-            Some(bound.absolute(peak, voxel_size))
-        }
-        _ => None,
-    };
-    let is_level_set = reader.grid().record.class == GridClass::LevelSet as u32;
-    let c = Comparison {
-        tree,
-        reader,
-        settings,
-        peak,
-        max_error,
-        sign_matters: is_level_set.then_some(SIGN_MATTERS_VOXELS * voxel_size),
-    };
+    let c = Comparison { tree, component, reader, promise };
     let mut error = FrameError::default();
     c.check_header(info, &mut error);
     c.check_tiles(&mut error);
@@ -148,6 +132,13 @@ pub(super) fn compare<T: Scalar>(
     error
 }
 
+struct Comparison<'a, T> {
+    tree: &'a Tree<T>,
+    component: Component,
+    reader: &'a FrameReader<'a>,
+    promise: &'a Promise<'a>,
+}
+
 /// How far the error that is measured may be from the one that the encoder left in the frame table: both
 /// are sums of the same squares, in another order.
 const NORM_TOLERANCE: f64 = 1e-12;
@@ -155,13 +146,21 @@ const NORM_TOLERANCE: f64 = 1e-12;
 impl<T: Scalar> Comparison<'_, T> {
     /// The source's value as the pack should have it.
     fn value(&self, value: T) -> f32 {
-        let value = value.to_f32();
-        if value.is_finite() || self.settings.nonfinite == NonFinite::Refuse { value } else { 0.0 }
+        let value = self.component.to_f32(value);
+        if value.is_finite() || self.promise.settings.nonfinite == NonFinite::Refuse { value } else { 0.0 }
+    }
+
+    /// How far a decoded value is from the source's, in the source's own type.
+    fn error(&self, ours: f32, theirs: T) -> f64 {
+        let packed = self.component.to_f32(theirs);
+        let is_packed = packed.is_finite() || self.promise.settings.nonfinite == NonFinite::Refuse;
+        if is_packed { self.component.error_of(theirs, ours) } else { f64::from(ours) }
     }
 
     fn check_header(&self, info: &GridInfo, error: &mut FrameError) {
         let frame = &self.reader.frame().record;
         let stats = self.tree.topology_stats();
+        error.active_voxels = stats.active_voxels;
         if frame.bbox != stats.bbox.to_array()
             || frame.leaves != stats.leaves
             || frame.active_voxels != stats.active_voxels
@@ -173,7 +172,7 @@ impl<T: Scalar> Comparison<'_, T> {
         }
         let (ours, theirs) = (self.reader.grid().background, self.value(self.tree.background));
         let empty = stats.leaves == 0 && self.tree.l1.is_empty() && self.tree.tiles.is_empty();
-        if ours.to_bits() != theirs.to_bits() && !empty {
+        if ours != theirs && !empty {
             error.fail(|| format!("the background is {ours}, the source's is {theirs}"));
         }
     }
@@ -200,19 +199,20 @@ impl<T: Scalar> Comparison<'_, T> {
         if active {
             error.active_value(value);
         }
-        let expected = Constant { value, active };
         let (region, region_dim) = self.reader.locate(origin);
         let same = match region {
             Region::Background => {
                 let background = self.reader.grid().background;
-                region_dim >= dim && !active && value.to_bits() == background.to_bits()
+                region_dim >= dim && !active && value == background
             }
-            Region::Constant(constant) => region_dim >= dim && constant.key() == expected.key(),
+            Region::Constant(constant) => {
+                region_dim >= dim && (constant.value, constant.active) == (value, active)
+            }
             Region::Brick(record) => {
                 region_dim >= dim
                     && self.reader.decode(&record).is_ok_and(|brick| {
                         let state = if active { Mask512::ALL } else { Mask512::NONE };
-                        brick.active == state && brick.values.iter().all(|v| v.to_bits() == value.to_bits())
+                        brick.active == state && brick.values.iter().all(|v| *v == value)
                     })
             }
         };
@@ -227,6 +227,7 @@ impl<T: Scalar> Comparison<'_, T> {
         entries.extend(self.tree.tiles.iter().map(|t| t.origin));
         entries.sort_unstable();
         self.reader.for_each_region(|origin, _, _| {
+            error.has_regions = true;
             if entries.binary_search(&origin.align_down(ROOT_DIM)).is_err() {
                 error.fail(|| format!("the pack has voxels at {:?}, where the source has none", origin.0));
             }
@@ -236,7 +237,8 @@ impl<T: Scalar> Comparison<'_, T> {
     /// The encoder's error is known to the last bit, so texels that were changed later give themselves
     /// away, also in block formats, whose own promise is loose.
     fn check_error_norm(&self, error: &mut FrameError) {
-        let (ours, theirs) = (error.texel_squares.sqrt(), self.reader.frame().record.error_norm);
+        let ours = error.codec_squares.iter().sum::<f64>().sqrt();
+        let theirs = self.reader.frame().record.error_norm;
         // What the pack says may be infinite or no number, and is not near anything then.
         let is_near = (ours - theirs).abs() <= NORM_TOLERANCE * ours;
         if !is_near {
@@ -244,22 +246,24 @@ impl<T: Scalar> Comparison<'_, T> {
         }
     }
 
-    /// What the codec of a region promises of a leaf's voxels.
+    /// What follows for a leaf's voxels from what the pack was asked for and what it records: nothing else may be asked of
+    /// them.
     fn contract(&self, region: &Region, leaf: usize) -> Contract {
+        let settings = self.promise.settings;
         // What is as good as background in a lossy pack without masks needs no record.
-        let drops_masks = match self.settings.masks {
+        let drops_masks = match settings.masks {
             Masks::Keep => false,
             Masks::Drop => true,
-            Masks::Auto => self.sign_matters.is_none() && self.reader.grid().background == 0.0,
+            Masks::Auto => self.promise.sign_matters.is_none() && self.reader.grid().background == 0.0,
         };
-        let may_be_empty = self.settings.format == Format::Adaptive && drops_masks;
+        let may_be_empty = settings.format == Format::Adaptive && drops_masks;
         let record = match region {
             Region::Brick(record) => record,
             Region::Background if may_be_empty => {
                 return Contract {
                     keeps_mask: false,
                     exact_inactive: false,
-                    has_record: true,
+                    codec: Some(Codec::Constant),
                     values: Bound::Nothing,
                 };
             }
@@ -267,7 +271,7 @@ impl<T: Scalar> Comparison<'_, T> {
                 return Contract {
                     keeps_mask: true,
                     exact_inactive: true,
-                    has_record: false,
+                    codec: None,
                     values: Bound::Exact,
                 };
             }
@@ -279,11 +283,11 @@ impl<T: Scalar> Comparison<'_, T> {
         // Room for the arithmetic of decoding, which is in f32.
         let slack = 1e-6 * (span + f64::from(sequence.lo).abs());
         let values = match record.codec {
-            _ if self.settings.clustering.is_some() => Bound::Nothing,
+            _ if settings.clustering.is_some() => Bound::Nothing,
             // A brick may read texels that were made for another, and a record does not say whether it does: their ranges
             // may well be equal. What was asked, and the frame's error norm, hold all the same.
-            codec if self.settings.format == Format::Adaptive && codec.is_normalised() => Bound::Nothing,
-            Codec::Constant if self.settings.format == Format::Adaptive => {
+            codec if settings.format == Format::Adaptive && codec.is_normalised() => Bound::Nothing,
+            Codec::Constant if settings.format == Format::Adaptive => {
                 // The value lies between the least and the greatest that it stands for.
                 let (source, mask) = (self.tree.leaves.values(leaf), &self.tree.leaves.masks[leaf]);
                 let carried = (0..BRICK_VOXELS).filter(|&i| mask.get(i) || !exact_inactive);
@@ -297,7 +301,7 @@ impl<T: Scalar> Comparison<'_, T> {
             // Blocks promise no more than to stay inside the brick's range.
             Codec::Bc4 | Codec::Bc7 => Bound::Within(extent + slack),
         };
-        Contract { keeps_mask: record.mask.is_some(), exact_inactive, has_record: true, values }
+        Contract { keeps_mask: record.mask.is_some(), exact_inactive, codec: Some(record.codec), values }
     }
 
     fn leaf(&self, leaf: usize) -> FrameError {
@@ -324,8 +328,8 @@ impl<T: Scalar> Comparison<'_, T> {
             },
         };
         let contract = self.contract(&region, leaf);
-        let spread = match (&region, self.max_error) {
-            (Region::Brick(record), Some(_)) => self.reader.spread(record).ok(),
+        let spread = match &region {
+            Region::Brick(record) if self.promise.bounds_voxels() => self.reader.spread(record).ok(),
             _ => None,
         };
         if contract.keeps_mask && active != *mask {
@@ -333,30 +337,36 @@ impl<T: Scalar> Comparison<'_, T> {
         }
         for i in 0..BRICK_VOXELS {
             let (ours, theirs) = (values[i], self.value(source[i]));
-            let difference = f64::from(ours) - f64::from(theirs);
-            let flipped = self.sign_matters.is_some() && (ours < 0.0) != (theirs < 0.0);
+            let difference = self.error(ours, source[i]);
+            let float_difference = f64::from(ours) - f64::from(theirs);
+            let flipped = self.promise.sign_matters.is_some() && (ours < 0.0) != (theirs < 0.0);
+            let from_texel = contract.codec.filter(|_| mask.get(i) || !contract.exact_inactive);
             error.all.voxel(difference, flipped);
-            if contract.is_texel(mask.get(i)) {
-                error.texel_squares += difference * difference;
+            if let Some(codec) = from_texel {
+                error.codec_squares[codec as usize] += float_difference * float_difference;
             }
             if mask.get(i) {
                 error.active.voxel(difference, flipped);
-                // Where all values are one there is no range to measure by.
-                let scale = if self.peak > 0.0 { self.peak } else { 1.0 };
-                error.histogram[bin(difference.abs() / scale)] += 1;
+                error.active_float_squares += float_difference * float_difference;
+                error.histogram[bin(difference.abs() / self.promise.peak)] += 1;
             }
             let at = || origin.offset_by(Coord::child_offset(i, 3, 1)).0;
-            if flipped && self.sign_matters.is_some_and(|d| f64::from(theirs).abs() > d) {
+            let reach = float_difference.abs() + f64::from(spread.as_ref().map_or(0.0, |s| s[i]));
+            if flipped && self.promise.sign_matters.is_some_and(|d| f64::from(theirs).abs() > d) {
                 error.fail(|| format!("the sign at {:?} flipped: {ours}, the source has {theirs}", at()));
             } else if !contract.allows(ours, theirs, mask.get(i)) {
                 error.fail(|| format!("the value at {:?} is {ours}, the source has {theirs}", at()));
-            } else if let Some(bound) = self.max_error
-                && contract.is_texel(mask.get(i))
-                && difference.abs() + f64::from(spread.as_ref().map_or(0.0, |s| s[i])) > bound
-            {
+            } else if from_texel.is_none() {
+                // A rule gives it, and it is exact.
+            } else if self.promise.max_error.is_some_and(|bound| reach > bound) {
+                error.fail(|| {
+                    format!("the value at {:?} is {ours}, the source has {theirs}: past max_error", at())
+                });
+            } else if self.promise.error_below.is_some_and(|limit| reach >= limit) {
                 error.fail(|| {
                     format!(
-                        "the value at {:?} is {ours}, the source has {theirs}: past max_error {bound}",
+                        "the value at {:?} is {ours}, the source has the integer {theirs}: choose f32, a finer quality, or \
+                         integers = \"nearest\" to give integers up",
                         at()
                     )
                 });
@@ -372,14 +382,14 @@ struct Contract {
     keeps_mask: bool,
     /// Whether inactive voxels come from a rule and must be exact.
     exact_inactive: bool,
-    /// Whether a record gives the values, and not the tree above it.
-    has_record: bool,
+    /// What gives the values, if it is a record and not the tree above it. What has become background counts as constant.
+    codec: Option<Codec>,
     /// How far a voxel's value may be off.
     values: Bound,
 }
 
 enum Bound {
-    /// Not a bit.
+    /// Not at all.
     Exact,
     /// The nearest half float.
     Half,
@@ -390,20 +400,16 @@ enum Bound {
 }
 
 impl Contract {
-    /// Whether a voxel's value comes from a texel.
-    fn is_texel(&self, active: bool) -> bool {
-        self.has_record && (active || !self.exact_inactive)
-    }
-
+    /// Values are compared as numbers: −0 is 0.
     fn allows(&self, ours: f32, theirs: f32, active: bool) -> bool {
-        let exact = ours.to_bits() == theirs.to_bits();
+        let exact = ours == theirs;
         if !active && self.exact_inactive {
             return exact;
         }
         match self.values {
             Bound::Exact => exact,
             Bound::Nothing => true,
-            Bound::Half => ours.to_bits() == half::f16::from_f32(theirs).to_f32().to_bits(),
+            Bound::Half => ours == half::f16::from_f32(theirs).to_f32(),
             Bound::Within(bound) => (f64::from(ours) - f64::from(theirs)).abs() <= bound,
         }
     }

@@ -5,8 +5,11 @@ use serde::{Deserialize, Serialize};
 
 use super::PicturesReport;
 use super::compare::{ERROR_BINS, Error, FrameError, Histogram};
-use crate::pack::Pack;
-use crate::settings::{FRAME_MARGIN_DB, Format, Quality};
+use super::promise::Promise;
+use crate::codec::Codec;
+use crate::pack::{Grid, Pack};
+use crate::settings::{FRAME_MARGIN_DB, Format, Quality, Settings};
+use crate::units::count;
 use crate::volume::ValueRange;
 
 /// How far decoded values are from the source's.
@@ -16,8 +19,8 @@ pub struct Metrics {
     pub voxels: u64,
     /// Root mean square error, in the grid's units.
     pub rmse: f64,
-    /// Decibels under the peak (maximum less minimum of the sequence's active values); null where the
-    /// error is zero.
+    /// Decibels under the peak: the range of the sequence's active values, or where they are all one their distance from the
+    /// background. Null where there is no error.
     pub psnr: Option<f64>,
     /// The largest error, in the grid's units.
     pub max_error: f64,
@@ -87,11 +90,13 @@ pub struct VerifyReport {
 
 impl Metrics {
     fn new(error: &Error, peak: f64) -> Self {
-        let rmse = if error.voxels == 0 { 0.0 } else { (error.squares / error.voxels as f64).sqrt() };
+        let voxels = error.voxels.max(1) as f64;
+        // The squares of the smallest errors are 0, but an error is one.
+        let rmse = (error.squares / voxels).sqrt().max(error.max / voxels.sqrt());
         Self {
             voxels: error.voxels,
             rmse,
-            psnr: (rmse > 0.0 && peak > 0.0).then(|| 20.0 * (peak / rmse).log10()),
+            psnr: (error.max > 0.0).then(|| 20.0 * (peak / rmse).log10()),
             max_error: error.max,
             sign_flips: error.sign_flips,
         }
@@ -107,60 +112,119 @@ fn worse(a: Metrics, b: Metrics) -> Metrics {
 /// PSNR is summed in another order here than when bricks were allocated.
 const PSNR_TOLERANCE_DB: f64 = 1e-3;
 
-/// What an adaptive pack promised of its grids, frames and size and does not keep. The largest error is checked voxel
+/// A PSNR at which nothing of a grid can be recognised: an RMSE of a tenth of its range.
+const RUINED_DB: f64 = 20.0;
+
+/// What an adaptive pack was asked for and does not keep, of a grid and its frames. The largest error is checked voxel
 /// by voxel.
-fn broken_promises(pack: &Pack, grids: &[GridReport], frames: &[FrameReport]) -> Vec<String> {
-    let settings = &pack.provenance.settings;
-    if settings.format != Format::Adaptive {
-        return Vec::new();
-    }
-    let below = |metrics: &Metrics, asked: f64| metrics.psnr.filter(|db| *db < asked - PSNR_TOLERANCE_DB);
+fn broken_psnr(promise: &Promise, grid: &GridReport, frames: &[FrameReport]) -> Vec<String> {
+    let settings = promise.settings;
     let mut broken = Vec::new();
     let mut floor = settings.min_frame_psnr;
-    if let Quality::Psnr(asked) = settings.quality {
-        floor = floor.or(Some(asked - FRAME_MARGIN_DB));
-        broken.extend(grids.iter().filter_map(|g| {
-            below(&g.active, asked).map(|db| format!("grid {:?}: {db:.3} dB, {asked} were promised", g.grid))
-        }));
+    let below = |metrics: &Metrics, asked: f64| metrics.psnr.filter(|db| *db < asked - PSNR_TOLERANCE_DB);
+    match promise.quality {
+        Quality::Psnr(asked) => {
+            floor = floor.or(Some(asked - FRAME_MARGIN_DB));
+            broken.extend(below(&grid.active, asked).map(|db| {
+                format!("grid {:?}: {db:.3} dB is below the {asked} dB that were asked", grid.grid)
+            }));
+        }
+        // Every voxel of every frame keeps the bound that was asked instead.
+        Quality::MaxError(_) => floor = None,
+        _ => {}
     }
     broken.extend(frames.iter().filter_map(|f| {
         let db = below(&f.active, floor?)?;
-        Some(format!("grid {:?} frame {}: {db:.3} dB, at least {} were promised", f.grid, f.frame, floor?))
+        Some(format!(
+            "grid {:?} frame {}: {db:.3} dB is below the {} dB minimum of a frame",
+            f.grid, f.frame, floor?
+        ))
     }));
+    broken
+}
+
+/// Bytes that are more than an adaptive pack was asked for.
+fn broken_size(pack: &Pack, settings: &Settings) -> Option<String> {
     let bytes = pack.gpu_bytes();
     let leaves =
         pack.grids.iter().flat_map(|g| &g.frames).map(|f| f.record.leaves).fold(0, u64::saturating_add);
     match settings.quality {
         Quality::Size(asked) if bytes > asked => {
-            broken.push(format!("{bytes} bytes on the GPU, at most {asked} were promised"));
+            Some(format!("{bytes} bytes on the GPU exceed the {asked} that were asked"))
         }
         Quality::BitsPerVoxel(asked) if bytes as f64 > asked * 64.0 * leaves as f64 && leaves > 0 => {
+            Some(format!("{bytes} bytes on the GPU exceed the {asked} bits a voxel that were asked"))
+        }
+        _ => None,
+    }
+}
+
+/// What is so far from its source that nobody can have meant it, where nothing of the kind was asked.
+fn ruined(promise: &Promise, grid: &GridReport, errors: &[FrameError]) -> Option<String> {
+    let voxels: u64 = errors.iter().map(|error| error.active_voxels).sum();
+    if grid.active.max_error > 0.0 && !errors.iter().any(|error| error.has_regions) {
+        return Some(format!(
+            "grid {:?}: the pack has none of its {} active voxels: ask for a finer quality or more bytes",
+            grid.grid,
+            count(voxels)
+        ));
+    }
+    let is_asked = promise.settings.format == Format::Adaptive
+        && matches!(promise.quality, Quality::Psnr(_) | Quality::MaxError(_));
+    let psnr = grid.active.psnr.filter(|db| *db < RUINED_DB && !is_asked)?;
+    Some(format!(
+        "grid {:?}: {psnr:.1} dB is under {RUINED_DB} dB, at which nothing of it can be recognised: ask for a finer quality, \
+         more bytes or another format",
+        grid.grid
+    ))
+}
+
+/// How far the square root of a sum of squares is from itself as an `f32`, and summed in another order; and the step of the
+/// smallest floats.
+const CODEC_NORM_TOLERANCE: f64 = 1e-6;
+const SMALLEST_FLOAT: f64 = 1.5e-45;
+
+/// What the grid table says of its source or its encoding and is not so.
+fn broken_table(grid: &Grid, errors: &[FrameError]) -> Vec<String> {
+    let mut broken = Vec::new();
+    let range = ValueRange::union_all(errors.iter().filter_map(|error| error.active_range));
+    let recorded = ValueRange { min: grid.record.active_min, max: grid.record.active_max };
+    if range.is_some_and(|range| range != recorded) {
+        broken.push(format!("grid {:?}: the grid table's active values are not the source's", grid.name));
+    }
+    for (tag, recorded) in grid.record.codec_norms.into_iter().enumerate() {
+        let found = errors.iter().map(|error| error.codec_squares[tag]).sum::<f64>().sqrt();
+        let recorded = f64::from(recorded);
+        let is_near = (found - recorded).abs() <= CODEC_NORM_TOLERANCE * found + SMALLEST_FLOAT
+            || found > f64::from(f32::MAX);
+        if !is_near {
+            let codec = Codec::from_tag(tag as u32).map_or("unknown", Codec::name);
             broken.push(format!(
-                "{bytes} bytes on the GPU are more than the {asked} bits a voxel that were promised"
+                "grid {:?}: the error of its {codec} bricks is {found:e}, the grid table has {recorded:e}",
+                grid.name
             ));
         }
-        _ => {}
     }
     broken
 }
 
 impl VerifyReport {
-    /// Sums up the errors of each frame of each grid.
-    pub(super) fn new(pack: &Pack, errors: Vec<Vec<FrameError>>) -> Self {
-        let (mut grids, mut frames, mut failures) = (Vec::new(), Vec::new(), Vec::new());
-        for (grid, errors) in pack.grids.iter().zip(errors) {
-            let range = super::union(&errors);
-            let peak = range.map_or(0.0, ValueRange::width);
-            let recorded = ValueRange { min: grid.record.active_min, max: grid.record.active_max };
-            if range.is_some_and(|range| range != recorded) {
-                failures.push(format!(
-                    "grid {:?}: the grid table's active values are not the source's",
-                    grid.name
-                ));
-            }
+    /// Sums up the errors of each frame of each grid, to which belongs whether its source's values are integers. `failures` are
+    /// what was found to be wrong before.
+    pub(super) fn new(
+        pack: &Pack,
+        settings: &Settings,
+        errors: Vec<(Vec<FrameError>, bool)>,
+        mut failures: Vec<String>,
+    ) -> Self {
+        let (mut grids, mut frames) = (Vec::new(), Vec::new());
+        for (grid, (errors, is_integer)) in pack.grids.iter().zip(errors) {
+            let promise = Promise::new(grid, settings, is_integer);
+            let peak = promise.peak;
             let (mut active, mut all) = (Error::default(), Error::default());
             let mut histogram = [0; ERROR_BINS];
-            for (frame, error) in grid.frames.iter().zip(errors) {
+            let first_frame = frames.len();
+            for (frame, error) in grid.frames.iter().zip(&errors) {
                 active.add(&error.active);
                 all.add(&error.all);
                 histogram.iter_mut().zip(error.histogram).for_each(|(sum, count)| *sum += count);
@@ -176,15 +240,23 @@ impl VerifyReport {
                         .map(|f| format!("grid {:?} frame {}: {f}", grid.name, frame.record.number)),
                 );
             }
-            grids.push(GridReport {
+            let report = GridReport {
                 grid: grid.name.clone(),
                 peak,
                 active: Metrics::new(&active, peak),
                 all: Metrics::new(&all, peak),
                 histogram,
-            });
+            };
+            failures.extend(broken_table(grid, &errors));
+            if settings.format == Format::Adaptive {
+                failures.extend(broken_psnr(&promise, &report, &frames[first_frame..]));
+            }
+            failures.extend(ruined(&promise, &report, &errors));
+            grids.push(report);
         }
-        failures.extend(broken_promises(pack, &grids, &frames));
+        if settings.format == Format::Adaptive {
+            failures.extend(broken_size(pack, settings));
+        }
         let worst_frame = frames
             .iter()
             .filter_map(|f| {

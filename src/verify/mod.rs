@@ -8,13 +8,14 @@
 mod compare;
 mod metrics;
 mod pictures;
+mod promise;
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
-pub use compare::{ERROR_BINS, Histogram, SIGN_MATTERS_VOXELS};
+pub use compare::{ERROR_BINS, Histogram};
 pub use metrics::{FrameReport, GridReport, Metrics, VerifyReport, WorstFrame};
 pub use pictures::{
     DIFFERENCE_GAIN, PictureReport, PictureSettings, PicturesReport, Seen, TracerDifference, difference_map,
@@ -22,12 +23,13 @@ pub use pictures::{
 };
 
 use crate::error::{Error, Result};
-use crate::pack::Pack;
+use crate::pack::{Frame, Grid, Pack, Provenance};
+use crate::stages::component::find_packed;
 use crate::stages::metadata::digest;
-use crate::stages::select::find;
-use crate::vdb::{VdbFile, with_scalar_type};
-use crate::volume::ValueRange;
+use crate::vdb::{GridClass, VdbFile, with_scalar_type};
 use compare::{FrameError, compare};
+use promise::Promise;
+pub use promise::{KEPT_INTEGER_ERROR, SIGN_MATTERS_VOXELS};
 
 /// The files that a pack was made from, told by their digests.
 pub struct Sources(Vec<PathBuf>);
@@ -60,23 +62,82 @@ pub fn voxels(
     mut advance: impl FnMut(u64),
 ) -> Result<VerifyReport> {
     let paths = &sources.0;
-    let mut errors: Vec<Vec<Option<FrameError>>> =
+    let mut found: Vec<Vec<Option<FoundFrame>>> =
         pack.grids.iter().map(|g| g.frames.iter().map(|_| None).collect()).collect();
+    let mut failures = check_tables(pack, &pack.provenance);
     let places: Vec<usize> = (0..paths.len()).collect();
     for window in places.chunks(at_once) {
         crate::interrupt::check()?;
         let results: Vec<_> =
             window.par_iter().map(|&source| compare_source(pack, source, &paths[source])).collect();
         for result in results {
-            for (grid, frame, error) in result? {
-                errors[grid][frame] = Some(error);
+            let (frames, missing) = result?;
+            failures.extend(missing);
+            for frame in frames {
+                let [g, f] = frame.place;
+                found[g][f] = Some(frame);
             }
             advance(1);
         }
     }
-    let errors =
-        errors.into_iter().map(|g| g.into_iter().map(|f| f.expect("every frame has a source")).collect());
-    Ok(VerifyReport::new(pack, errors.collect()))
+    let mut errors = Vec::new();
+    for (grid, frames) in pack.grids.iter().zip(found) {
+        let frames: Vec<FoundFrame> =
+            frames.into_iter().map(|f| f.expect("every frame has a source")).collect();
+        failures.extend(check_class(grid, &frames));
+        let is_integer = frames.iter().any(|frame| frame.is_integer);
+        errors.push((frames.into_iter().map(|frame| frame.error).collect(), is_integer));
+    }
+    Ok(VerifyReport::new(pack, &pack.provenance.settings, errors, failures))
+}
+
+/// What a frame of a pack came to beside its source.
+struct FoundFrame {
+    /// Its grid and its place among the grid's frames.
+    place: [usize; 2],
+    class: GridClass,
+    is_integer: bool,
+    error: FrameError,
+}
+
+/// What the tables say and was not asked for.
+fn check_tables(pack: &Pack, provenance: &Provenance) -> Vec<String> {
+    let settings = &provenance.settings;
+    let mut broken = Vec::new();
+    for grid in &pack.grids {
+        if grid.record.fps != settings.fps.unwrap_or(0.0) {
+            broken.push(format!(
+                "grid {:?}: {} frames per second, {} were asked",
+                grid.name,
+                grid.record.fps,
+                settings.fps.unwrap_or(0.0)
+            ));
+        }
+        for frame in &grid.frames {
+            let (number, source) = (frame.record.number, &provenance.sources[frame.record.source as usize]);
+            if number != source.frame {
+                broken.push(format!(
+                    "grid {:?}: frame {number} is frame {} of its source",
+                    grid.name, source.frame
+                ));
+            }
+        }
+    }
+    let is_there = |name: &&String| {
+        let is_part = |grid: &Grid| grid.name.rsplit_once('.').is_some_and(|(base, _)| base == **name);
+        pack.grids.iter().any(|grid| grid.name == **name || is_part(grid))
+    };
+    let missing = settings.grids.iter().filter(|name| !is_there(name));
+    broken.extend(missing.map(|name| format!("grid {name:?} was asked for and is not in the pack")));
+    broken
+}
+
+/// A grid has the class that any of its frames states.
+fn check_class(grid: &Grid, frames: &[FoundFrame]) -> Option<String> {
+    let stated = frames.iter().map(|frame| frame.class).find(|class| *class != GridClass::Unknown);
+    let class = stated.unwrap_or(GridClass::Unknown);
+    (grid.record.class != class as u32)
+        .then(|| format!("grid {:?}: its class is not the source's, which is {}", grid.name, class.name()))
 }
 
 /// The file of each of the pack's sources.
@@ -105,35 +166,45 @@ fn match_sources(pack: &Pack, sources: &[PathBuf]) -> Result<Vec<PathBuf>> {
     found.collect()
 }
 
-/// Compares the frames that one source file holds: grid, frame, and what differs.
-fn compare_source(pack: &Pack, source: usize, path: &Path) -> Result<Vec<(usize, usize, FrameError)>> {
+/// Compares the frames that one source file holds, and says which of them the pack lacks.
+fn compare_source(pack: &Pack, source: usize, path: &Path) -> Result<(Vec<FoundFrame>, Vec<String>)> {
     let file = VdbFile::open(path).map_err(Error::vdb(path))?;
     let settings = &pack.provenance.settings;
-    let mut out = Vec::new();
+    let (mut out, mut missing) = (Vec::new(), Vec::new());
     for (g, grid) in pack.grids.iter().enumerate() {
-        let of_source = |f: &crate::pack::Frame| f.record.source as usize == source;
-        for f in (0..grid.frames.len()).filter(|&f| of_source(&grid.frames[f])) {
-            let info =
-                find(&file.grids, &grid.name).ok_or_else(|| pictures::missing_grid(path, &grid.name))?;
+        let of_source = |f: &Frame| f.record.source as usize == source;
+        let frames: Vec<usize> = (0..grid.frames.len()).filter(|&f| of_source(&grid.frames[f])).collect();
+        let Some((info, component)) = find_packed(&file.grids, &grid.name, settings.integers) else {
+            if frames.is_empty() {
+                continue;
+            }
+            return Err(pictures::missing_grid(path, &grid.name));
+        };
+        if frames.len() != 1 {
+            missing.push(format!(
+                "grid {:?}: the pack has {} frames of {}, which is one",
+                grid.name,
+                frames.len(),
+                path.display()
+            ));
+        }
+        let promise = Promise::new(grid, settings, info.value_type.is_integer());
+        for f in frames {
             let reader = pack.frame(g, f).map_err(|e| {
                 Error::Verify(format!("grid {:?} frame {}: {e}", grid.name, grid.frames[f].record.number))
             })?;
             let error = with_scalar_type!(&info.value_type,
                 T => {
                     let tree = file.read_tree::<T>(info).map_err(Error::vdb(path))?;
-                    compare(&tree, info, &reader, settings)
+                    compare(&tree, info, component, &reader, &promise)
                 },
                 other => return Err(Error::Verify(format!(
                     "{}: grid {:?} is {} in the file", path.display(), grid.name, other.name()
                 )))
             );
-            out.push((g, f, error));
+            let is_integer = info.value_type.is_integer();
+            out.push(FoundFrame { place: [g, f], class: info.class, is_integer, error });
         }
     }
-    Ok(out)
-}
-
-/// The range of all frames' active values.
-fn union(errors: &[FrameError]) -> Option<ValueRange> {
-    ValueRange::union_all(errors.iter().filter_map(|e| e.active_range))
+    Ok((out, missing))
 }

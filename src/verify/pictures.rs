@@ -16,8 +16,8 @@ use crate::render::{
     Device, Difference, Field, Image, Mode, Renderer, Scene, TraceError, View, apart, difference,
     optical_depths, trace, trace_noting_bc4, write_png,
 };
+use crate::stages::component::find_packed;
 use crate::stages::flatten::flatten;
-use crate::stages::select::find;
 use crate::vdb::VdbFile;
 
 /// Pixels of a picture's side.
@@ -274,8 +274,10 @@ fn source_field(pack: &Pack, sources: &Sources, [g, f]: [usize; 2]) -> Result<Fi
     let grid = &pack.grids[g];
     let path = sources.path(grid.frames[f].record.source);
     let file = VdbFile::open(path).map_err(Error::vdb(path))?;
-    let info = find(&file.grids, &grid.name).ok_or_else(|| missing_grid(path, &grid.name))?;
-    let flat = flatten(&file, path, info, pack.provenance.settings.nonfinite)?;
+    let settings = &pack.provenance.settings;
+    let (info, component) = find_packed(&file.grids, &grid.name, settings.integers)
+        .ok_or_else(|| missing_grid(path, &grid.name))?;
+    let flat = flatten(&file, path, info, component, settings.nonfinite)?;
     Ok(Field::from_flat(flat.frame, flat.background))
 }
 

@@ -73,6 +73,14 @@ impl ValueRange {
         Self { min: self.min.min(other.min), max: self.max.max(other.max) }
     }
 
+    /// What errors of a grid are measured against: the width of the range of its active values. Where they are all one, how
+    /// far that is from the background; where that is nothing either, 1.
+    pub fn peak(active: Option<Self>, background: f32) -> f64 {
+        let Some(active) = active else { return 1.0 };
+        let from_background = (f64::from(active.max) - f64::from(background)).abs();
+        [active.width(), from_background].into_iter().find(|peak| *peak > 0.0).unwrap_or(1.0)
+    }
+
     /// The smallest range around all of them; `None` for none.
     pub fn union_all(ranges: impl IntoIterator<Item = Self>) -> Option<Self> {
         ranges.into_iter().reduce(Self::union)
@@ -94,6 +102,8 @@ pub struct FrameStats {
     pub active_range: Option<ValueRange>,
     /// Values that were infinite or not a number.
     pub nonfinite: u64,
+    /// How far the nearest `f32` is from a value at most: 0 for floats and halves, and for integers up to 2^24.
+    pub rounding: f64,
 }
 
 impl FlatFrame {

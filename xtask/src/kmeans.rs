@@ -14,6 +14,7 @@ use rand_xoshiro::Xoshiro256Plus;
 use serde_json::json;
 use volpack::settings::NonFinite;
 use volpack::stages::allocate::kmeans::{KMeansSettings, kmeans};
+use volpack::stages::component::Component;
 use volpack::stages::flatten::flatten;
 use volpack::stages::select::find;
 use volpack::vdb::VdbFile;
@@ -86,7 +87,7 @@ fn bricks(args: &Args) -> Result<Array2<f32>, Box<dyn Error>> {
     for path in volpack::manifest::expand(&args.files)? {
         let file = VdbFile::open(&path)?;
         let info = find(&file.grids, &args.grid).ok_or("no such grid")?;
-        let frame = flatten(&file, &path, info, NonFinite::Refuse)?.frame;
+        let frame = flatten(&file, &path, info, Component::Whole, NonFinite::Refuse)?.frame;
         peak = peak.max(frame.stats.active_range.map_or(0.0, |r| r.max));
         values.extend(frame.bricks.iter().flat_map(|b| b.values));
     }

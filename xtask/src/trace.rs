@@ -79,7 +79,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             let uploaded = gpu.upload(&pack)?;
             let bounds = pack.frame_tree(0, 0).bounds();
             let grid = &pack.grids[0];
-            for &(shows, mode, interpolation) in if grid.record.class == 1 { LEVEL_SET } else { FOG } {
+            for &(shows, mode, interpolation) in if grid.is_level_set() { LEVEL_SET } else { FOG } {
                 let scene = Scene { interpolation, ..Scene::new(grid, 0, &VIEW, mode, size) };
                 if let (Format::F32, Ok(peer)) = (format, &peer) {
                     // What the converter itself allows: a tenth of a voxel where there is a level set.

@@ -16,15 +16,19 @@ pub struct AdaptiveGrid<'a> {
     pub tree: &'a mut SequenceTree,
     /// What codecs make of its bricks.
     pub encodings: Encodings,
+    /// What is asked of it, where no size is asked of all.
+    pub quality: Quality,
+    /// What its errors are measured against.
+    pub peak: f64,
     /// A voxel's smallest side.
     pub voxel_size: f64,
 }
 
-/// What a pack is asked for.
+/// What a pack is asked for beside the quality of each grid.
 #[derive(Clone, Copy, Debug)]
 pub struct Target {
-    /// The whole.
-    pub quality: Quality,
+    /// The most bytes of tree, masks and texels together.
+    pub size: Option<u64>,
     /// The PSNR that no frame falls below; 6 dB below the whole's where none is given.
     pub min_frame_psnr: Option<f64>,
     /// Bytes of tree and masks with a record for every brick; only where a size is asked for.
@@ -46,21 +50,21 @@ pub fn adaptive(
         grid.encodings.make(grid.tree, &all, &AT_ONCE, |_| ())?;
         searches.push(GridSearch::new(grid)?);
     }
-    let picks = match target.quality {
-        Quality::Psnr(db) => {
-            let floor = target.min_frame_psnr.unwrap_or(db - FRAME_MARGIN_DB);
-            searches.iter_mut().map(|s| s.at_psnr(db, floor, advance)).collect::<io::Result<_>>()?
-        }
-        Quality::MaxError(bound) => {
-            let within = |s: &mut GridSearch| s.within(bound.absolute(s.table.peak, s.voxel_size), advance);
-            searches.iter_mut().map(within).collect::<io::Result<_>>()?
-        }
-        Quality::BitsPerVoxel(bits) => {
-            let leaves = |s: &GridSearch| s.tree.frames.iter().map(|f| f.stats.leaves).sum::<u64>();
-            let voxels = 512 * searches.iter().map(leaves).sum::<u64>();
-            at_size(&mut searches, (bits * voxels as f64 / 8.0) as u64, target, advance)?
-        }
-        Quality::Size(bytes) => at_size(&mut searches, bytes, target, advance)?,
+    let picks = match target.size {
+        Some(bytes) => at_size(&mut searches, bytes, target, advance)?,
+        None => searches
+            .iter_mut()
+            .map(|search| match search.quality {
+                Quality::Psnr(db) => {
+                    let floor = target.min_frame_psnr.unwrap_or(db - FRAME_MARGIN_DB);
+                    search.at_psnr(db, floor, advance)
+                }
+                Quality::MaxError(bound) => {
+                    search.within(bound.absolute(search.table.peak, search.voxel_size), advance)
+                }
+                other => unreachable!("{other} is a size, or was made one that suits the grid"),
+            })
+            .collect::<io::Result<_>>()?,
     };
     let each = searches.into_iter().zip(picks);
     Ok(each.map(|(search, picks)| search.finish(&picks)).collect::<io::Result<_>>()?)

@@ -105,9 +105,7 @@ impl Weighed<'_> {
 
 /// An error in squared peaks.
 fn in_peaks(norm: f64, peak: f64) -> f64 {
-    // Where all active values are the same, nothing but no error will do.
-    let peak = if peak > 0.0 { peak } else { f64::MIN_POSITIVE };
-    if norm == 0.0 { 0.0 } else { (norm / peak) * (norm / peak) }
+    (norm / peak) * (norm / peak)
 }
 
 /// Bricks that are looked at together: what a thread reads of the table at a time.
@@ -115,7 +113,7 @@ pub(super) const BLOCK: u32 = 1024;
 
 /// What every rung comes to for every brick. A long sequence's table is in scratch, and passes over it read it anew.
 pub(super) struct Table {
-    /// Maximum less minimum of active values.
+    /// What errors are measured against.
     pub peak: f64,
     /// Of each rung; looked up more than anything else.
     texel_bits: [f64; Rung::ALL.len()],

@@ -14,10 +14,10 @@ use super::choices::{BLOCK, Choices, Table, Weighed, costs};
 use super::rung::Rung;
 use super::share::{Loan, loans};
 use super::{Allocation, Coding, windows};
+use crate::settings::Quality;
 use crate::stages::dedup::{FrameTree, Payload, SequenceTree};
 use crate::stages::encodings::{Cost, Encodings, KeptCodec, Kind};
 use crate::trace;
-use crate::volume::ValueRange;
 
 /// A step is 1.1 % of λ, under 0.05 dB of PSNR.
 const STEPS_PER_OCTAVE: u32 = 64;
@@ -49,6 +49,11 @@ pub(super) struct GridSearch<'a> {
     pub(super) tree: &'a mut SequenceTree,
     encodings: Encodings,
     pub(super) voxel_size: f64,
+    pub(super) quality: Quality,
+    /// How far the nearest float is from a value of the source at most.
+    source_rounding: f64,
+    /// Whether nothing would be left of the grid were every brick empty, though it has something to show.
+    may_vanish: bool,
     pub(super) table: Table,
     /// The coarsest step that each brick may have, for the sake of the frames it is in.
     pub(super) least_step: Vec<u16>,
@@ -73,34 +78,46 @@ impl<'a> GridSearch<'a> {
                 records[id as usize] += 1;
             }
         }
-        let peak = tree.active_range().map_or(0.0, ValueRange::width);
         let mut search = Self {
             least_step: vec![0; uses.len()],
             bc7_is_tried: vec![false; uses.len()],
             lends: vec![None; uses.len()],
             active_voxels: tree.frames.iter().map(|f| f.stats.active_leaf_voxels).sum(),
             voxel_size: grid.voxel_size,
-            table: Table::new(&tree.scratch, peak),
+            quality: grid.quality,
+            source_rounding: tree.frames.iter().map(|frame| frame.stats.rounding).fold(0.0, f64::max),
+            may_vanish: false,
+            table: Table::new(&tree.scratch, grid.peak),
             encodings: grid.encodings,
             tree,
         };
         for ids in windows(uses.len() as u32, BLOCK) {
             let costs = costs(&search.encodings, &ids, &search.bc7_is_tried)?;
             let choices = |&id: &u32| Choices::new(uses[id as usize], records[id as usize]);
+            search.may_vanish |= costs.iter().any(|(costs, _)| costs[Rung::Empty as usize].norm > 0.0);
             search.table.add(ids.iter().map(choices).zip(costs.into_iter().map(|(costs, _)| costs)))?;
         }
+        search.may_vanish &= !search.tree.has_constants();
         Ok(search)
     }
 
-    /// The squared peaks that `voxels` may err by together at some PSNR.
-    fn allowance(voxels: u64, psnr: f64) -> f64 {
-        voxels as f64 * 10f64.powf(-psnr / 10.0) * ROUNDING
+    /// Whether a choice leaves nothing of a grid that has something to show: a few bright voxels among many that are 0 may
+    /// be less than the error that a PSNR allows.
+    fn is_nothing(&self, picks: &[Rung]) -> bool {
+        self.may_vanish && picks.iter().all(|rung| *rung == Rung::Empty)
     }
 
-    /// The PSNR of so many squared peaks. Without a peak there is none above any error.
-    fn psnr(&self, voxels: u64, squares: f64) -> f64 {
-        let voxels = if self.table.peak > 0.0 { voxels as f64 } else { 0.0 };
-        10.0 * (voxels / squares).log10()
+    /// The squared peaks that `voxels` may err by together at some PSNR, against the nearest floats of their source.
+    fn allowance(&self, voxels: u64, psnr: f64) -> f64 {
+        let allowed = voxels as f64 * 10f64.powf(-psnr / 10.0) * ROUNDING;
+        // Were every voxel's float as far from its source as that of the worst, errors would add up to no more than this.
+        let rounding = (voxels as f64).sqrt() * self.source_rounding / self.table.peak;
+        (allowed.sqrt() - rounding).max(0.0).powi(2)
+    }
+
+    /// The PSNR of so many squared peaks.
+    fn psnr(voxels: u64, squares: f64) -> f64 {
+        10.0 * (voxels as f64 / squares).log10()
     }
 
     /// The rung that a brick gets at a step.
@@ -171,10 +188,13 @@ impl<'a> GridSearch<'a> {
         mut near: Option<u32>,
         advance: &mut dyn FnMut(u64),
     ) -> io::Result<(u32, Vec<Rung>)> {
-        let allowed = Self::allowance(self.active_voxels, psnr);
+        let allowed = self.allowance(self.active_voxels, psnr);
         loop {
             let span = trace::span("search");
-            let step = first_step(near, |step| Ok(self.squares_at(step)? <= allowed))?;
+            let step = first_step(near, |step| {
+                Ok(self.squares_at(step)? <= allowed
+                    && !(self.may_vanish && self.is_nothing(&self.picks(step)?)))
+            })?;
             drop(span);
             near = Some(step);
             let fine = self.picks(step)?;
@@ -191,7 +211,7 @@ impl<'a> GridSearch<'a> {
                 picks[brick as usize] = fine[brick as usize];
             }
             // Differences were added up; the sum itself decides.
-            if self.squares(&picks)? > allowed {
+            if self.squares(&picks)? > allowed || self.is_nothing(&picks) {
                 picks = fine;
             }
             self.spend_slack(&mut picks, allowed, step)?;
@@ -215,7 +235,7 @@ impl<'a> GridSearch<'a> {
                 picks[brick as usize] = coarser[brick as usize];
             }
         }
-        if self.squares(picks)? > allowed {
+        if self.squares(picks)? > allowed || self.is_nothing(picks) {
             picks.copy_from_slice(&before);
         }
         Ok(())
@@ -276,6 +296,7 @@ impl<'a> GridSearch<'a> {
     }
 
     pub(super) fn within(&mut self, bound: f64, advance: &mut dyn FnMut(u64)) -> io::Result<Vec<Rung>> {
+        let bound = (bound - self.source_rounding).max(0.0);
         let fits = |cost: &Cost| cost.norm.is_finite() && f64::from(cost.max) <= bound;
         loop {
             let mut picks = Vec::with_capacity(self.table.len() as usize);
@@ -293,7 +314,7 @@ impl<'a> GridSearch<'a> {
 
     /// The PSNR of all frames together.
     pub(super) fn whole(&self, picks: &[Rung]) -> io::Result<f64> {
-        Ok(self.psnr(self.active_voxels, self.squares(picks)?))
+        Ok(Self::psnr(self.active_voxels, self.squares(picks)?))
     }
 
     /// The squared error of one frame over active voxels.
@@ -308,7 +329,7 @@ impl<'a> GridSearch<'a> {
     pub(super) fn worst_frame(&self, picks: &[Rung]) -> io::Result<f64> {
         let mut worst = f64::INFINITY;
         for frame in &self.tree.frames {
-            let db = self.psnr(frame.stats.active_leaf_voxels, self.frame_squares(frame, picks)?);
+            let db = Self::psnr(frame.stats.active_leaf_voxels, self.frame_squares(frame, picks)?);
             // Where there is no error, or no voxel to err, there is no worst.
             if db.is_finite() {
                 worst = worst.min(db);
@@ -329,7 +350,7 @@ impl<'a> GridSearch<'a> {
         // All are judged before loans are called in for the sake of some.
         let mut low: Vec<(usize, f64)> = Vec::new();
         for (f, frame) in self.tree.frames.iter().enumerate() {
-            let allowed = Self::allowance(frame.stats.active_leaf_voxels, floor);
+            let allowed = self.allowance(frame.stats.active_leaf_voxels, floor);
             let rises = |id: u32| u32::from(self.least_step[id as usize]) < LAST_STEP;
             // What no step meets is met as nearly as the last one does.
             if self.frame_squares(frame, picks)? > allowed && self.tree.frame_bricks(frame).any(rises) {

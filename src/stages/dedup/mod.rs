@@ -398,7 +398,17 @@ impl SequenceTree {
         ValueRange::union_all(active.chain(self.brick_ranges.iter().copied()))
     }
 
-    /// The range of active values, tiles included: the peak that PSNR is measured against.
+    /// Whether anything of it is constant without being a brick: it stays whatever becomes of bricks.
+    pub fn has_constants(&self) -> bool {
+        let of_frame = |frame: &FrameTree| {
+            !frame.roots.is_empty()
+                || frame.cells.iter().any(|(_, cell)| matches!(cell, CellRef::Constant(_)))
+        };
+        let is_constant = |entry: &u32| matches!(self.record(*entry).payload(), Payload::Constant(_));
+        self.frames.iter().any(of_frame) || self.runs.items().iter().any(is_constant)
+    }
+
+    /// The range of active values, tiles included.
     pub fn active_range(&self) -> Option<ValueRange> {
         ValueRange::union_all(self.frames.iter().filter_map(|f| f.stats.active_range))
     }

@@ -1,6 +1,6 @@
 //! How far decoded values are from a brick's.
 
-use super::Cost;
+use super::{Cost, Terms};
 use crate::volume::{BRICK_VOXELS, Brick, Mask512};
 
 /// Sums that run side by side: the order of adding is fixed, and a compiler may use vectors.
@@ -14,13 +14,20 @@ pub struct Measure<'a> {
     counts: [f32; BRICK_VOXELS],
     active: [f32; BRICK_VOXELS],
     sign_matters: Option<f64>,
+    error_below: f64,
 }
 
 impl<'a> Measure<'a> {
-    /// `carried` are the voxels that texels give; `sign_matters` says of level sets from what distance on a voxel must
-    /// not change sides.
-    pub(super) fn new(brick: &'a Brick, carried: &'a Mask512, sign_matters: Option<f64>) -> Self {
-        Self { brick, carried, counts: carried.weights(), active: brick.active.weights(), sign_matters }
+    /// `carried` are the voxels that texels give; `terms` say what must not become of them.
+    pub(super) fn new(brick: &'a Brick, carried: &'a Mask512, terms: &Terms) -> Self {
+        Self {
+            brick,
+            carried,
+            counts: carried.weights(),
+            active: brick.active.weights(),
+            sign_matters: terms.sign_matters,
+            error_below: terms.error_below.unwrap_or(f64::INFINITY),
+        }
     }
 
     /// What `decoded` costs, and what a GPU that is `spread` off at each voxel may read.
@@ -47,6 +54,9 @@ impl<'a> Measure<'a> {
             }
         }
         let max = max.into_iter().fold(0.0, f64::max);
+        if max >= self.error_below {
+            return Cost::IMPOSSIBLE;
+        }
         // Rounded up, because a bound is what it is compared with.
         let max = if f64::from(max as f32) < max { (max as f32).next_up() } else { max as f32 };
         let root = |lanes: [f64; LANES]| lanes.iter().sum::<f64>().sqrt();

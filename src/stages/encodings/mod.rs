@@ -161,6 +161,8 @@ pub struct Terms {
     pub aim: ConstantAim,
     /// Level sets: a voxel further from the surface than this must not change sides.
     pub sign_matters: Option<f64>,
+    /// No voxel may be as far off, on any GPU: integers that are kept.
+    pub error_below: Option<f64>,
 }
 
 /// Bricks of a batch at least: four fill the lanes of the BC7 encoder.
@@ -254,7 +256,7 @@ impl Encodings {
 
     /// Measures what decoded values cost a brick whose texels give the voxels in `carried`.
     pub fn measure<'a>(&self, brick: &'a Brick, carried: &'a Mask512) -> Measure<'a> {
-        Measure::new(brick, carried, self.terms.sign_matters)
+        Measure::new(brick, carried, &self.terms)
     }
 
     fn kept(&self, kind: Kind) -> &Kept {

@@ -23,6 +23,8 @@ pub struct GridInput {
     pub name: String,
     /// What kind of field it holds.
     pub class: GridClass,
+    /// Whether its source's values are integers.
+    pub is_integer: bool,
     /// Frames per second; 0 when not stated.
     pub fps: f32,
     /// Its frames, in the order of `tree`.
