@@ -349,7 +349,7 @@ fn a_build_is_explained() {
     fs::write(shop.path("pipeline.toml"), format!("{MANIFEST}psnr = 50\n")).unwrap();
     let text = explain();
     for line in [
-        "because quality was psnr 45 and is psnr 50",
+        "because quality was psnr 55 (level sets: max-error 0.05 voxels) and is psnr 50",
         "because anim_0003.vdb changed",
         "because anim_0009.vdb came",
         "because anim_0008.vdb went",

@@ -206,12 +206,12 @@ fn one_bad_asset_is_reported_among_the_others() {
 #[test]
 fn a_cheaper_setting_that_cannot_be_reached_fails_nothing() {
     let folder = tempfile::tempdir().unwrap();
-    // The least that can be reached, as the error for less names it.
-    write_manifest(folder.path(), "", "size = 1", "");
+    // The least that can be reached where no frame may be ruined, as the error for less names it.
+    write_manifest(folder.path(), "", "min_frame_psnr = 25\nsize = 1", "");
     let output = volpack(folder.path(), &["build", "-q", "--asset", "puff"]);
     let said = String::from_utf8(output.stderr).unwrap();
     let least = said.split_once("the least is ").and_then(|(_, rest)| rest.split_once(':')).unwrap().0;
-    write_manifest(folder.path(), "", &format!("size = {least}"), "");
+    write_manifest(folder.path(), "", &format!("min_frame_psnr = 25\nsize = {least}"), "");
     let output = volpack(folder.path(), &["report", "--json", "r.json", "-q", "--asset", "puff"]);
     let said = String::from_utf8(output.stderr).unwrap();
     assert_eq!((output.status.code(), &*said), (Some(0), ""));

@@ -70,7 +70,7 @@ impl fmt::Display for Quality {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::ByClass { psnr, level_set_error } => {
-                write!(f, "psnr {psnr}, of level sets max-error {level_set_error}")
+                write!(f, "psnr {psnr} (level sets: max-error {level_set_error})")
             }
             Self::Psnr(db) => write!(f, "psnr {db}"),
             Self::MaxError(bound) => write!(f, "max-error {bound}"),
