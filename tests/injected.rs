@@ -4,13 +4,14 @@ mod common;
 #[path = "../fuzz/common/reseal.rs"]
 mod reseal;
 
+use std::mem::offset_of;
 use std::path::{Path, PathBuf};
 
 use common::{build_verified, fixture};
 use reseal::reseal;
 use volpack::codec::Codec;
-use volpack::pack::layout::{FrameRecord, Header, Section, kind};
-use volpack::pack::tree::{NODE_WORDS, RECORD_WORDS, header};
+use volpack::pack::layout::{FrameRecord, GridRecord, Header, Section, kind};
+use volpack::pack::tree::{NODE_WORDS, RECORD_WORDS, grid, header};
 use volpack::pack::{Pack, Region};
 use volpack::settings::{Format, Settings};
 use volpack::verify::{Sources, voxels};
@@ -18,16 +19,19 @@ use volpack::verify::{Sources, voxels};
 /// A pack in memory whose sections lie in it as they are.
 struct Victim {
     bytes: Vec<u8>,
-    source: PathBuf,
+    sources: Vec<PathBuf>,
 }
 
 impl Victim {
     fn new(name: &str, grid: &str, format: Format, folder: &Path) -> Self {
+        Self::of(vec![fixture(name)], grid, format, folder)
+    }
+
+    fn of(sources: Vec<PathBuf>, grid: &str, format: Format, folder: &Path) -> Self {
         let settings = Settings { grids: vec![grid.to_owned()], format, zstd: 0, ..Settings::default() };
-        let source = fixture(name);
-        let (_, report) = build_verified(std::slice::from_ref(&source), settings, folder);
+        let (_, report) = build_verified(&sources, settings, folder);
         assert!(report.ok);
-        let victim = Self { bytes: std::fs::read(folder.join("test.volpack")).unwrap(), source };
+        let victim = Self { bytes: std::fs::read(folder.join("test.volpack")).unwrap(), sources };
         assert_eq!(victim.verdict(|_| {}), None, "resealing alone changes nothing");
         victim
     }
@@ -50,7 +54,7 @@ impl Victim {
             Err(e) => return Some(e.to_string()),
         };
         pack.check_chunks().expect("the digests are right");
-        let sources = Sources::find(&pack, std::slice::from_ref(&self.source)).unwrap();
+        let sources = Sources::find(&pack, &self.sources).unwrap();
         let report = voxels(&pack, &sources, 1, |_| {}).unwrap();
         report.failures.first().cloned()
     }
@@ -161,9 +165,45 @@ fn an_error_norm_that_is_no_number_passes_nothing() {
     let victim = Victim::new("fog_half_zip.vdb", "density", Format::Bc7, folder.path());
     for norm in [f64::NAN, f64::INFINITY, 0.0] {
         let found = victim.verdict(|bytes| {
-            let at = Victim::section(bytes, kind::FRAMES) + std::mem::offset_of!(FrameRecord, error_norm);
+            let at = Victim::section(bytes, kind::FRAMES) + offset_of!(FrameRecord, error_norm);
             bytes[at..at + 8].copy_from_slice(&norm.to_le_bytes());
         });
         assert!(found.is_some_and(|found| found.contains("the encoder left")), "{norm}");
     }
+}
+
+/// Tables are of use to engines, and nothing in a picture or a voxel gives their entries away.
+#[test]
+fn tables_that_say_another_thing_are_found() {
+    let folder = tempfile::tempdir().unwrap();
+    let sources = vec![fixture("anim_0001.vdb"), fixture("anim_0002.vdb")];
+    let victim = Victim::of(sources, "density", Format::Unorm8, folder.path());
+    let changed = |section: u32, at: usize, to: [u8; 4]| {
+        victim.verdict(|bytes| {
+            let at = Victim::section(bytes, section) + at;
+            assert_ne!(bytes[at..at + 4], to);
+            bytes[at..at + 4].copy_from_slice(&to);
+        })
+    };
+    let grid = |at, to| changed(kind::GRIDS, at, to);
+    let class = grid(offset_of!(GridRecord, class), 1u32.to_le_bytes());
+    assert!(class.is_some_and(|found| found.contains("class")), "a wrong class");
+    let fps = grid(offset_of!(GridRecord, fps), 24f32.to_le_bytes());
+    assert!(fps.is_some_and(|found| found.contains("frames per second")), "a wrong frame rate");
+    let least = grid(offset_of!(GridRecord, active_min), (-1f32).to_le_bytes());
+    assert!(least.is_some_and(|found| found.contains("active values")), "a wrong range");
+    let cost = grid(offset_of!(GridRecord, codec_norms) + 4 * Codec::Unorm8 as usize, 0f32.to_le_bytes());
+    assert!(cost.is_some_and(|found| found.contains("unorm8")), "a wrong cost");
+    let number = changed(kind::FRAMES, offset_of!(FrameRecord, number), 0i32.to_le_bytes());
+    assert!(number.is_some_and(|found| found.contains("frame 0")), "a wrong number");
+
+    let missing = victim.verdict(|bytes| {
+        let grids = Victim::section(bytes, kind::GRIDS) + offset_of!(GridRecord, frames);
+        bytes[grids..grids + 4].copy_from_slice(&1u32.to_le_bytes());
+        let tree = Victim::section(bytes, kind::TREE);
+        let grid_at = u32::from_le_bytes(bytes[tree + 8..tree + 12].try_into().unwrap()) as usize;
+        let frames = tree + 4 * (grid_at + grid::FRAMES);
+        bytes[frames..frames + 4].copy_from_slice(&1u32.to_le_bytes());
+    });
+    assert!(missing.is_some(), "a frame that is missing");
 }
