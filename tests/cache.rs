@@ -362,6 +362,29 @@ fn a_build_is_explained() {
     assert_eq!(json[0]["explanation"]["stages"][0]["stage"], "flatten");
 }
 
+/// CI machines have no GPU: what the CPU tracer verified there holds until there is one.
+#[test]
+fn a_verification_without_a_device_is_kept_until_there_is_one() {
+    let shop = Shop::new();
+    let folder = shop.folder.path();
+    fs::write(shop.path("pipeline.toml"), MANIFEST).unwrap();
+    let run = |args: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_volpack"));
+        command.env("VOLPACK_CACHE", folder.join("cache")).current_dir(folder).args(args);
+        // No driver is where Vulkan's loader is told to look.
+        command.env("VK_DRIVER_FILES", "/nowhere").env("VK_ICD_FILENAMES", "/nowhere").output().unwrap()
+    };
+    let first = stdout(&run(&["build"]));
+    assert!(first.contains("by the CPU tracer alone: no Vulkan device found"), "{first}");
+    assert_eq!(stdout(&run(&["explain"])), "puff: up to date\n");
+    let again: Json = serde_json::from_str(&stdout(&run(&["build", "--json"]))).unwrap();
+    assert_eq!(again["assets"][0]["cache"]["verify"], serde_json::json!({ "hits": 1, "misses": 0 }));
+    if common::gpu().is_some() {
+        assert!(stdout(&volpack(folder, &["explain"])).contains("another device"));
+        assert!(!stdout(&volpack(folder, &["build"])).contains("by the CPU tracer alone"));
+    }
+}
+
 #[test]
 fn the_cache_is_looked_after() {
     let shop = Shop::new();

@@ -54,6 +54,10 @@ pub fn explain(job: &Job) -> Result<Explanation> {
     }
     if !is_verified {
         say("verify", "voxels and pictures".to_owned());
+        if is_there {
+            out.reasons
+                .push("it was not verified by voxels and pictures, or another device traced them".to_owned());
+        }
     }
     Ok(out)
 }

@@ -6,6 +6,8 @@ use super::{Job, Made, VerifyLevel};
 use crate::cache::{Blob, Cache, Key, Stage, Stamp};
 use crate::error::{Error, Result};
 use crate::pack::{FinishedPack, Pack, PackError, Provenance, repack};
+use crate::render::Device;
+use crate::render::gpu::Gpu;
 use crate::settings::Settings;
 use crate::stages::metadata::{Digests, digest};
 use crate::verify::VerifyReport;
@@ -13,7 +15,9 @@ use crate::verify::VerifyReport;
 const PACK: Stage = Stage { name: "pack", version: 1, travels: true };
 /// A pack whose level of zstd is not what was asked for, but all else is.
 const ANY_LEVEL: Stage = Stage { name: "pack-any-zstd", version: 1, travels: true };
-const VERIFY: Stage = Stage { name: "verify", version: 2, travels: true };
+const VERIFY: Stage = Stage { name: "verify", version: 3, travels: true };
+/// A verification whose pictures were traced by the CPU alone, since no device could.
+const VERIFY_ON_CPU: Stage = Stage { name: "verify-on-cpu", version: 1, travels: true };
 
 /// What the cache may have for a job.
 pub(super) struct Reuse<'a> {
@@ -78,7 +82,7 @@ impl<'a> Reuse<'a> {
 
     /// Whether the cache has the verification as the job asks for it.
     pub fn is_verified(&self, job: &Job) -> bool {
-        self.verify_key(job).is_some_and(|key| self.cache.has(&key))
+        self.verify_keys(job).any(|key| self.cache.has(&key))
     }
 
     /// Whether a file has a blob's bytes.
@@ -123,26 +127,36 @@ impl<'a> Reuse<'a> {
 
     /// What verification as the job asks for it found in the same pack.
     pub fn verification(&self, job: &Job) -> Option<Option<VerifyReport>> {
-        self.cache.get(&self.verify_key(job)?)
+        let mut keys = self.verify_keys(job).peekable();
+        let first = *keys.peek()?;
+        let found = keys.find_map(|key| self.cache.peek(&key));
+        self.cache.count(&first, found.is_some());
+        found
     }
 
     /// Keeps what verification found. Failures are found again.
     pub fn keep_verification(&self, job: &Job, report: Option<&VerifyReport>) {
-        // Without a GPU or its driver half of the pictures are left out: there may be one next time.
-        let is_whole = |report: &VerifyReport| {
-            report.ok && report.pictures.as_ref().is_none_or(|pictures| pictures.skipped.is_none())
-        };
-        if let Some(key) = self.verify_key(job).filter(|_| report.is_none_or(is_whole)) {
+        if report.is_some_and(|report| !report.ok) {
+            return;
+        }
+        let pictures = report.and_then(|report| report.pictures.as_ref());
+        let is_on_cpu = pictures.is_some_and(|pictures| pictures.skipped.is_some());
+        if let Some(key) = self.verify_keys(job).nth(usize::from(is_on_cpu)) {
             self.cache.put(&key, &report);
         }
     }
 
-    /// A pack names its sources by their digests, so its own stands for them too. `None` where files are to be written,
-    /// or nothing to be found.
-    fn verify_key(&self, job: &Job) -> Option<Key> {
-        if job.verify == VerifyLevel::None || job.pictures.images.is_some() {
-            return None;
-        }
-        Some(Key::new(&VERIFY, &(self.pack?.digest, job.verify, job.pictures.max_flip, job.pictures.device)))
+    /// The keys under which the verification of a pack may be: as it was asked for, and without a device where that was
+    /// left out. The latter holds as long as the device, or that there is none, is the same: which takes a look at it, and
+    /// is worked out when the former is not there. A pack names its sources by their digests, so its own stands for them
+    /// too. None where files are to be written, or nothing to be found.
+    fn verify_keys(&self, job: &Job) -> impl Iterator<Item = Key> {
+        let asked = (job.verify != VerifyLevel::None && job.pictures.images.is_none()).then_some(self.pack);
+        let asked =
+            asked.flatten().map(|blob| (blob.digest, job.verify, job.pictures.max_flip, job.pictures.device));
+        let may_lack_device = job.verify == VerifyLevel::All && job.pictures.device == Device::Auto;
+        let on_cpu = asked.filter(|_| may_lack_device).into_iter();
+        let on_cpu = on_cpu.map(|asked| Key::new(&VERIFY_ON_CPU, &(asked, Gpu::identity())));
+        asked.map(|asked| Key::new(&VERIFY, &asked)).into_iter().chain(on_cpu)
     }
 }

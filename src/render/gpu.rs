@@ -76,7 +76,18 @@ impl Gpu {
             .map_err(|e| GpuError::Unavailable(e.clone()))
     }
 
-    fn open() -> Result<Self, GpuError> {
+    /// What would trace, in words that change with the adapter and its driver; `None` where there is none. It is asked
+    /// for once in a process, and takes a fraction of [`Gpu::shared`].
+    pub fn identity() -> Option<&'static str> {
+        static IDENTITY: OnceLock<Option<String>> = OnceLock::new();
+        let of = |adapter: wgpu::Adapter| {
+            let info = adapter.get_info();
+            format!("{} {} {:?} {}", info.name, info.driver, info.backend, info.driver_info)
+        };
+        IDENTITY.get_or_init(|| Self::adapter().ok().map(of)).as_deref()
+    }
+
+    fn adapter() -> Result<wgpu::Adapter, GpuError> {
         // Vulkan, Metal and Direct3D 12 only: the GL backend decodes 3-D BC4 wrong.
         let instance = wgpu::Instance::new(wgpu::InstanceDescriptor {
             backends: wgpu::Backends::VULKAN | wgpu::Backends::METAL | wgpu::Backends::DX12,
@@ -86,8 +97,12 @@ impl Gpu {
             power_preference: wgpu::PowerPreference::HighPerformance,
             ..Default::default()
         };
-        let adapter = pollster::block_on(instance.request_adapter(&options))
-            .map_err(|_| GpuError::Unavailable("no GPU and no software Vulkan answers".to_owned()))?;
+        pollster::block_on(instance.request_adapter(&options))
+            .map_err(|_| GpuError::Unavailable("no Vulkan device found".to_owned()))
+    }
+
+    fn open() -> Result<Self, GpuError> {
+        let adapter = Self::adapter()?;
         let info = adapter.get_info();
         let lacks = |what: &str| GpuError::Lacks { adapter: info.name.clone(), what: what.to_owned() };
         let blocks =
