@@ -84,17 +84,26 @@ fn adaptive(
     check_size(grids, settings.quality)
 }
 
+/// A level set whose distances keep a bound keeps its signs where the surface is further than this part of it: its surface
+/// is what was asked for, and a wide band has edges along which thousands of voxels are next to 0.
+const SIGNED_PART_OF_BOUND: f64 = 0.2;
+
 fn terms(grid: &GridInput, settings: &Settings) -> Terms {
     let is_adaptive = settings.format == Format::Adaptive;
+    let (quality, voxel_size) = (quality(grid, settings), smallest_voxel(grid));
+    let sign_matters = verify::SIGN_MATTERS_VOXELS * voxel_size;
+    let (aim, sign_matters) = match quality {
+        Quality::MaxError(bound) => {
+            let bound = bound.absolute(peak(grid), voxel_size);
+            (ConstantAim::Max, sign_matters.min(SIGNED_PART_OF_BOUND * bound))
+        }
+        _ => (ConstantAim::Squares, sign_matters),
+    };
     Terms {
         range: settings.range,
-        aim: match quality(grid, settings) {
-            Quality::MaxError(_) => ConstantAim::Max,
-            _ => ConstantAim::Squares,
-        },
+        aim,
         // One codec for all bricks is kept whatever it does to signs and integers: verification says so.
-        sign_matters: (grid.class == GridClass::LevelSet && is_adaptive)
-            .then(|| verify::SIGN_MATTERS_VOXELS * smallest_voxel(grid)),
+        sign_matters: (grid.class == GridClass::LevelSet && is_adaptive).then_some(sign_matters),
         error_below: (grid.is_integer && settings.integers != Integers::Nearest && is_adaptive)
             .then_some(verify::KEPT_INTEGER_ERROR),
     }
