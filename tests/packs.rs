@@ -4,6 +4,7 @@ mod common;
 #[path = "common/vdb_writer.rs"]
 mod vdb_writer;
 
+use std::collections::BTreeSet;
 use std::path::Path;
 
 use common::{animation, build_verified, facts, fixture, fixtures, probes};
@@ -263,16 +264,37 @@ fn what_frames_share_is_stored_once() {
 }
 
 #[test]
-fn a_frame_reads_no_chunks_but_its_own() {
+fn a_frame_lists_the_chunks_of_its_bricks_and_no_others() {
     let folder = tempfile::tempdir().unwrap();
-    let (pack, _) = build_verified(&animation(), settings("density", Format::F32), folder.path());
-    let chunks: Vec<_> = pack.grids[0].frames.iter().map(|f| f.chunks.len()).collect();
-    assert!(
-        chunks.iter().all(|n| *n > 0 && *n <= pack.atlas(Codec::F32).unwrap().slabs as usize),
-        "{chunks:?}"
-    );
-    // Decoding with only the listed chunks loaded is what verification did; a frame that listed too
-    // few would have failed it.
+    // 343 bricks of 2 KB a frame are more than two slabs, and no frame has one of another's.
+    let noise = |frame: u32| {
+        move |voxel: [i32; 3]| {
+            let seed = voxel
+                .iter()
+                .fold(frame + 1, |h, v| (h ^ *v as u32).wrapping_mul(0x9e37_79b1).rotate_left(11));
+            (seed as f32 / u32::MAX as f32, true)
+        }
+    };
+    let frame = |frame: u32| {
+        let path = folder.path().join(format!("noise_{frame:04}.vdb"));
+        write_grid(&path, &GridFile::new("density", "Tree_float_5_4_3", 0.0f32).fill([7; 3], noise(frame)));
+        path
+    };
+    let frames: Vec<_> = (0..3).map(frame).collect();
+    let (pack, _) = build_verified(&frames, settings("density", Format::F32), folder.path());
+    let atlas = pack.atlas(Codec::F32).unwrap();
+    assert!(atlas.slabs > 6, "{atlas:?}");
+    for (f, frame) in pack.grids[0].frames.iter().enumerate() {
+        let mut needed = BTreeSet::new();
+        pack.frame_tree(0, f).for_each_region(|_, _, region| {
+            if let Region::Brick(record) = region {
+                needed.insert(record.slot / atlas.slab_bricks());
+            }
+        });
+        // Texels are the first section of a file, and slabs its first chunks.
+        assert_eq!(frame.chunks, Vec::from_iter(needed), "frame {f}");
+        assert!(frame.chunks.len() <= atlas.slabs as usize / 2, "frame {f} needs {:?}", frame.chunks);
+    }
 }
 
 #[test]

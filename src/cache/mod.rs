@@ -172,6 +172,11 @@ impl Cache {
         std::mem::take(&mut *lock(&self.uses))
     }
 
+    /// Whether anything was found since then.
+    pub fn gave_something(&self) -> bool {
+        lock(&self.uses).values().any(|uses| uses.hits > 0)
+    }
+
     /// Counts a result that was, or was not, where it was looked for. [`Cache::get`] does so itself.
     pub fn count(&self, key: &Key, hit: bool) {
         let mut uses = lock(&self.uses);

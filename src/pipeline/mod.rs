@@ -159,7 +159,8 @@ fn build_with(job: &Job, alter: Option<Alter>, progress: &mut dyn Progress) -> R
     let cache = job.cache.as_ref().filter(|_| alter.is_none());
     let mut outcome = build_cached(job, cache, alter, progress);
     if let Err(Error::Misled(what)) = &outcome {
-        progress.warn(&format!("the cache misled the build, which begins anew without it: {what}"));
+        progress
+            .warn(&format!("what the cache gave does not verify, so the pack is built without it: {what}"));
         outcome = build_cached(job, None, alter, progress);
     }
     // Also after an error: what was done until then is there for the next build.
@@ -206,6 +207,11 @@ fn build_cached(
         Some(report) => (Pack::open(path).map_err(Error::pack(path)).map_err(misled)?, report, true),
         None => {
             let (pack, report) = verified(job, path, progress).map_err(misled)?;
+            // An entry with a right digest may still be another's: a build without the cache tells whose fault it is.
+            let failure = report.as_ref().and_then(|report| report.failures.first());
+            if let Some(failure) = failure.filter(|_| cache.is_some_and(|cache| cache.gave_something())) {
+                return Err(Error::Misled(failure.clone()));
+            }
             if let Some(reuse) = &reuse {
                 reuse.keep_verification(job, report.as_ref());
             }
