@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 use std::fs::File;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use bytemuck::Pod;
@@ -13,9 +13,8 @@ use super::atlas::Atlas;
 use super::error::corrupt;
 use super::layout::{AtlasRecord, Chunk, FrameRecord, GridRecord, Section, encoding, kind};
 use super::tables::{chunk_range, read_tables};
-use super::{PackError, Provenance, check};
+use super::{PackError, Provenance, ProvenanceError, check};
 use crate::codec::{Codec, SequenceRange};
-use crate::settings::Settings;
 use crate::volume::Coord;
 
 /// A section that is read whole may not grow more than this in decoding, so that a small file cannot
@@ -29,6 +28,7 @@ const SMALL_SECTION: u64 = 1 << 24;
 /// Opening checks the tables, and that every index in them and in the tree lies inside what it
 /// points into. Texel chunks are checked when they are first read.
 pub struct Pack {
+    path: PathBuf,
     bytes: Bytes,
     /// The grids.
     pub grids: Vec<Grid>,
@@ -36,8 +36,6 @@ pub struct Pack {
     pub tree: Vec<u32>,
     /// The texture pages, one entry a codec that is used.
     pub atlases: Vec<Atlas>,
-    /// Where the pack comes from.
-    pub provenance: Provenance,
     pub(super) sections: Vec<Section>,
     chunks: Vec<Chunk>,
     /// The texel section's place for each of `atlases`.
@@ -114,7 +112,7 @@ impl Pack {
         // SAFETY: the map is only read. Another process that cuts the file short while it is mapped
         // can kill this one with SIGBUS; packs are replaced by renaming, never written in place.
         let map = unsafe { Mmap::map(&file)? };
-        Self::parse(Bytes::Mapped(map))
+        Self::parse(path.to_owned(), Bytes::Mapped(map))
     }
 
     /// The same for a pack that is in memory.
@@ -122,32 +120,37 @@ impl Pack {
     /// # Errors
     /// [`PackError`].
     pub fn from_bytes(bytes: Vec<u8>) -> Result<Self, PackError> {
-        Self::parse(Bytes::Memory(bytes))
+        Self::parse(PathBuf::from("(in memory)"), Bytes::Memory(bytes))
     }
 
-    fn parse(bytes: Bytes) -> Result<Self, PackError> {
+    /// The file that it was opened from, for messages.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Where the pack comes from. It is read when it is asked for, since no voxel depends on it.
+    ///
+    /// # Errors
+    /// [`ProvenanceError`].
+    pub fn provenance(&self) -> Result<Provenance, ProvenanceError> {
+        Provenance::from_json(&self.records(kind::PROVENANCE)?)
+    }
+
+    fn parse(path: PathBuf, bytes: Bytes) -> Result<Self, PackError> {
         let (sections, chunks) = read_tables(&bytes)?;
         let mut pack = Self {
             checked: chunks.iter().map(|_| AtomicBool::new(false)).collect(),
+            path,
             bytes,
             grids: Vec::new(),
             tree: Vec::new(),
             atlases: Vec::new(),
-            provenance: Provenance {
-                tool: String::new(),
-                version: String::new(),
-                encoder_isa: None,
-                settings: Settings::default(),
-                sources: Vec::new(),
-            },
             sections,
             chunks,
             texel_sections: Vec::new(),
         };
         pack.tree = pack.records(kind::TREE)?;
-        let provenance: Vec<u8> = pack.records(kind::PROVENANCE)?;
-        pack.provenance = serde_json::from_slice(&provenance)
-            .map_err(|e| PackError::Corrupt(format!("the provenance is not its JSON: {e}")))?;
+        pack.section(kind::PROVENANCE)?;
         for record in pack.records::<AtlasRecord>(kind::ATLASES)? {
             let (atlas, section) = pack.read_atlas(&record)?;
             pack.atlases.push(atlas);
@@ -216,7 +219,7 @@ impl Pack {
                 let chunks = slice(&lists, frame.first_chunk, frame.chunks).ok_or_else(|| {
                     PackError::Corrupt(format!("grid {name:?} frame {} has no chunk list", frame.number))
                 })?;
-                if frame.grid as usize != g || frame.source as usize >= self.provenance.sources.len() {
+                if frame.grid as usize != g {
                     return corrupt(format!("grid {name:?} frame {} is not its own", frame.number));
                 }
                 grid.frames.push(Frame { record: *frame, chunks: chunks.to_vec() });

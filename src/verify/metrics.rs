@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use super::PicturesReport;
 use super::compare::{ERROR_BINS, Error, FrameError, Histogram};
 use crate::pack::Pack;
-use crate::settings::{FRAME_MARGIN_DB, Format, Quality};
+use crate::settings::{FRAME_MARGIN_DB, Format, Quality, Settings};
 use crate::volume::ValueRange;
 
 /// How far decoded values are from the source's.
@@ -109,8 +109,12 @@ const PSNR_TOLERANCE_DB: f64 = 1e-3;
 
 /// What an adaptive pack promised of its grids, frames and size and does not keep. The largest error is checked voxel
 /// by voxel.
-fn broken_promises(pack: &Pack, grids: &[GridReport], frames: &[FrameReport]) -> Vec<String> {
-    let settings = &pack.provenance.settings;
+fn broken_promises(
+    pack: &Pack,
+    settings: &Settings,
+    grids: &[GridReport],
+    frames: &[FrameReport],
+) -> Vec<String> {
     if settings.format != Format::Adaptive {
         return Vec::new();
     }
@@ -146,7 +150,7 @@ fn broken_promises(pack: &Pack, grids: &[GridReport], frames: &[FrameReport]) ->
 
 impl VerifyReport {
     /// Sums up the errors of each frame of each grid.
-    pub(super) fn new(pack: &Pack, errors: Vec<Vec<FrameError>>) -> Self {
+    pub(super) fn new(pack: &Pack, settings: &Settings, errors: Vec<Vec<FrameError>>) -> Self {
         let (mut grids, mut frames, mut failures) = (Vec::new(), Vec::new(), Vec::new());
         for (grid, errors) in pack.grids.iter().zip(errors) {
             let range = super::union(&errors);
@@ -184,7 +188,7 @@ impl VerifyReport {
                 histogram,
             });
         }
-        failures.extend(broken_promises(pack, &grids, &frames));
+        failures.extend(broken_promises(pack, settings, &grids, &frames));
         let worst_frame = frames
             .iter()
             .filter_map(|f| {

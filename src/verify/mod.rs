@@ -22,7 +22,8 @@ pub use pictures::{
 };
 
 use crate::error::{Error, Result};
-use crate::pack::Pack;
+use crate::pack::{Pack, Provenance};
+use crate::settings::Settings;
 use crate::stages::metadata::digest;
 use crate::stages::select::find;
 use crate::vdb::{VdbFile, with_scalar_type};
@@ -30,20 +31,28 @@ use crate::volume::ValueRange;
 use compare::{FrameError, compare};
 
 /// The files that a pack was made from, told by their digests.
-pub struct Sources(Vec<PathBuf>);
+pub struct Sources {
+    files: Vec<PathBuf>,
+    /// What the pack was built with, which says what has to hold.
+    settings: Settings,
+}
 
 impl Sources {
     /// Finds the pack's sources among some files.
     ///
     /// # Errors
-    /// When one is missing, changed or unreadable.
+    /// When one is missing, changed or unreadable, or the pack's provenance cannot be used.
     pub fn find(pack: &Pack, files: &[PathBuf]) -> Result<Self> {
-        match_sources(pack, files).map(Self)
+        let provenance = pack.provenance().map_err(Error::provenance(pack))?;
+        for frame in pack.grids.iter().flat_map(|grid| &grid.frames) {
+            provenance.source(&frame.record).map_err(Error::provenance(pack))?;
+        }
+        Ok(Self { files: match_sources(&provenance, files)?, settings: provenance.settings })
     }
 
     /// The file at a place of the provenance's list.
     fn path(&self, source: u32) -> &Path {
-        &self.0[source as usize]
+        &self.files[source as usize]
     }
 }
 
@@ -59,14 +68,14 @@ pub fn voxels(
     at_once: usize,
     mut advance: impl FnMut(u64),
 ) -> Result<VerifyReport> {
-    let paths = &sources.0;
+    let Sources { files: paths, settings } = sources;
     let mut errors: Vec<Vec<Option<FrameError>>> =
         pack.grids.iter().map(|g| g.frames.iter().map(|_| None).collect()).collect();
     let places: Vec<usize> = (0..paths.len()).collect();
     for window in places.chunks(at_once) {
         crate::interrupt::check()?;
         let results: Vec<_> =
-            window.par_iter().map(|&source| compare_source(pack, source, &paths[source])).collect();
+            window.par_iter().map(|&source| compare_source(pack, settings, source, &paths[source])).collect();
         for result in results {
             for (grid, frame, error) in result? {
                 errors[grid][frame] = Some(error);
@@ -76,17 +85,17 @@ pub fn voxels(
     }
     let errors =
         errors.into_iter().map(|g| g.into_iter().map(|f| f.expect("every frame has a source")).collect());
-    Ok(VerifyReport::new(pack, errors.collect()))
+    Ok(VerifyReport::new(pack, settings, errors.collect()))
 }
 
 /// The file of each of the pack's sources.
-fn match_sources(pack: &Pack, sources: &[PathBuf]) -> Result<Vec<PathBuf>> {
+fn match_sources(provenance: &Provenance, sources: &[PathBuf]) -> Result<Vec<PathBuf>> {
     let digests: Vec<_> = sources.par_iter().map(|path| digest(path).map(|(hash, _)| hash)).collect();
     let mut by_digest = HashMap::new();
     for (path, digest) in sources.iter().zip(digests) {
         by_digest.insert(digest?.to_hex().to_string(), path);
     }
-    let found = pack.provenance.sources.iter().map(|source| {
+    let found = provenance.sources.iter().map(|source| {
         by_digest.get(&source.blake3).map(|path| (*path).clone()).ok_or_else(|| {
             let same_name = sources.iter().find(|p| p.file_name().is_some_and(|n| *n == *source.file));
             Error::Verify(match same_name {
@@ -106,9 +115,13 @@ fn match_sources(pack: &Pack, sources: &[PathBuf]) -> Result<Vec<PathBuf>> {
 }
 
 /// Compares the frames that one source file holds: grid, frame, and what differs.
-fn compare_source(pack: &Pack, source: usize, path: &Path) -> Result<Vec<(usize, usize, FrameError)>> {
+fn compare_source(
+    pack: &Pack,
+    settings: &Settings,
+    source: usize,
+    path: &Path,
+) -> Result<Vec<(usize, usize, FrameError)>> {
     let file = VdbFile::open(path).map_err(Error::vdb(path))?;
-    let settings = &pack.provenance.settings;
     let mut out = Vec::new();
     for (g, grid) in pack.grids.iter().enumerate() {
         let of_source = |f: &crate::pack::Frame| f.record.source as usize == source;

@@ -118,7 +118,7 @@ pub fn pictures(pack: &Pack, sources: &Sources, settings: &PictureSettings) -> R
     let mut report = PicturesReport {
         device: renderer.is_gpu().then(|| renderer.device_name().to_owned()),
         skipped: renderer.fallback.clone(),
-        max_flip: settings.max_flip.unwrap_or(default_max_flip(&pack.provenance.settings)),
+        max_flip: settings.max_flip.unwrap_or(default_max_flip(&sources.settings)),
         pictures: Vec::new(),
         failures: Vec::new(),
     };
@@ -208,8 +208,7 @@ fn trace_pack(pack: &Pack, [g, f]: [usize; 2]) -> Result<Option<(Scene, Image)>>
 
 fn trace_source(pack: &Pack, sources: &Sources, [g, f]: [usize; 2], scene: &Scene) -> Result<Image> {
     let grid = &pack.grids[g];
-    let path = sources.path(grid.frames[f].record.source);
-    let source = source_field(pack, path, &grid.name)?;
+    let source = source_field(sources, grid.frames[f].record.source, &grid.name)?;
     Ok(trace::<f32>(&source, scene).expect("the transform was inverted before"))
 }
 
@@ -235,12 +234,13 @@ pub fn look(pack: &Pack, sources: Option<&Sources>, place: [usize; 2]) -> Result
     Ok(Some(Seen { side: SIDE, pack: of_pack.to_rgb8(scene.mode), source }))
 }
 
-fn source_field(pack: &Pack, path: &Path, grid: &str) -> Result<Field> {
+fn source_field(sources: &Sources, source: u32, grid: &str) -> Result<Field> {
+    let path = sources.path(source);
     let file = VdbFile::open(path).map_err(Error::vdb(path))?;
     let info = find(&file.grids, grid).ok_or_else(|| {
         Error::Verify(format!("{}: grid {grid:?} is in the pack, but not in the file", path.display()))
     })?;
-    let flat = flatten(&file, path, info, pack.provenance.settings.nonfinite)?;
+    let flat = flatten(&file, path, info, sources.settings.nonfinite)?;
     Ok(Field::from_flat(flat.frame, flat.background))
 }
 
