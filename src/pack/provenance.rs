@@ -189,7 +189,12 @@ mod tests {
             assert!(says.starts_with(&format!("the pack was built by volpack 0.3.0 with {name}")), "{says}");
             assert!(error.is_unsupported() && says.ends_with("verify it with that version"), "{says}");
         }
-        for (from, to) in [("{", ""), ("\"tool\"", "\"tooth\""), ("\"settings\"", "\"set\""), ("[]", "[1]")] {
+        for (from, to) in [
+            ("{", ""),
+            ("\"tool\"", "\"tooth\""),
+            ("\"settings\"", "\"set\""),
+            ("\"sources\": []", "\"sources\": [1]"),
+        ] {
             let error = read(from, to).unwrap_err();
             assert!(matches!(error, ProvenanceError::Malformed(_)) && !error.is_unsupported(), "{error}");
         }
