@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use crate::codec::OutOfRange;
-use crate::pack::PackError;
+use crate::pack::{Pack, PackError, ProvenanceError};
 use crate::vdb::VdbError;
 
 /// Everything that a build, an inspection or a verification can fail with.
@@ -32,6 +32,14 @@ pub enum Error {
         path: PathBuf,
         /// What is wrong with it.
         source: PackError,
+    },
+    /// A pack whose provenance cannot be used, by something that needs it.
+    #[error("{}: {source}", path.display())]
+    Provenance {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with its provenance.
+        source: ProvenanceError,
     },
     /// A manifest that cannot be used.
     #[error("{}: {message}", path.display())]
@@ -110,6 +118,12 @@ impl Error {
         move |source| Self::Pack { path, source }
     }
 
+    /// Wraps what is wrong with a pack's provenance.
+    pub fn provenance(pack: &Pack) -> impl FnOnce(ProvenanceError) -> Self {
+        let path = pack.path().to_owned();
+        move |source| Self::Provenance { path, source }
+    }
+
     /// The process's exit code for this kind of failure, as `volpack help` lists them.
     pub fn exit_code(&self) -> u8 {
         match self {
@@ -124,7 +138,9 @@ impl Error {
             Self::Usage(_) => 2,
             Self::Vdb { source, .. } if source.is_unsupported() => 6,
             Self::Pack { source, .. } if source.is_unsupported() => 6,
-            Self::Vdb { .. } | Self::Pack { .. } | Self::Manifest { .. } | Self::Input(_) => 3,
+            Self::Provenance { source, .. } if source.is_unsupported() => 6,
+            Self::Vdb { .. } | Self::Pack { .. } | Self::Provenance { .. } => 3,
+            Self::Manifest { .. } | Self::Input(_) => 3,
             Self::Changed(_) | Self::Misled(_) => 3,
             Self::OutOfRange { .. } => 3,
             Self::Verify(_) => 4,

@@ -222,11 +222,11 @@ fn the_floor_that_nobody_named_helps_the_worst_frame() {
 /// found without the verifier.
 fn largest_errors(case: &Case, pack: &Pack) -> Vec<f64> {
     let of_grid = |g: usize| {
-        let grid = &pack.grids[g];
+        let (grid, provenance) = (&pack.grids[g], pack.provenance().unwrap());
         let (mut worst, mut min, mut max) = (0.0f64, f64::INFINITY, f64::NEG_INFINITY);
         let mut active = |value: f32| (min, max) = (min.min(value.into()), max.max(value.into()));
         for (f, frame) in grid.frames.iter().enumerate() {
-            let name = &pack.provenance.sources[frame.record.source as usize].file;
+            let name = &provenance.source(&frame.record).unwrap().file;
             let path = case.frames.iter().find(|p| p.ends_with(name)).unwrap();
             let file = VdbFile::open(path).unwrap();
             let tree: Tree<f32> =

@@ -3,21 +3,23 @@
 //! A bounded run of what `xtask mutate` does at length and the targets in `fuzz/` do without end.
 
 use std::mem::offset_of;
-use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use volpack::pack::layout::{Chunk, FrameRecord, GridRecord, Header, Section, kind};
-use volpack::pack::{Pack, PackError, Region, tree};
+use volpack::pack::layout::{FrameRecord, kind};
+use volpack::pack::{Pack, PackError, Region};
 use volpack::report::PackSummary;
 use volpack::vdb::{VdbError, VdbFile};
 
 #[path = "../fuzz/common/mod.rs"]
 mod common;
+#[path = "common/forgery.rs"]
+mod forgery;
 
 use common::mutate::{Case, pack_case, vdb_case};
 use common::seeds::Seed;
 use common::{entry, guard, reseal, seeds};
+use forgery::Forgery;
 
 const CASES: u64 = 1500;
 const SEED: u64 = 7;
@@ -155,7 +157,7 @@ fn a_damaged_pack_says_what_is_wrong() {
     assert!(matches!(&error, PackError::Digest { what } if what == "the header"), "{error}");
 
     // One texel byte: found when its chunk is first read, and not by opening.
-    let texels = Forgery { bytes: sound.clone() }.section(kind::TEXELS);
+    let texels = Forgery::new(sound.clone()).section(kind::TEXELS);
     let damaged = with(texels.start, &[sound[texels.start] ^ 1]);
     let pack = Pack::from_bytes(damaged).unwrap();
     for error in [pack.check_chunks().err(), pack.frame(0, 0).err()] {
@@ -164,151 +166,14 @@ fn a_damaged_pack_says_what_is_wrong() {
     }
 }
 
-/// A pack whose values are changed behind its digests.
-struct Forgery {
-    bytes: Vec<u8>,
-}
-
-impl Forgery {
-    fn of(packs: &[Seed], name: &str) -> Self {
-        Self { bytes: packs.iter().find(|p| p.name == name).unwrap().bytes.clone() }
-    }
-
-    fn u32(&self, at: usize) -> u32 {
-        u32::from_le_bytes(*self.bytes[at..].first_chunk().unwrap())
-    }
-
-    fn u64(&self, at: usize) -> u64 {
-        u64::from_le_bytes(*self.bytes[at..].first_chunk().unwrap())
-    }
-
-    fn set_u32(&mut self, at: usize, value: u32) {
-        self.bytes[at..at + 4].copy_from_slice(&value.to_le_bytes());
-    }
-
-    fn set_u64(&mut self, at: usize, value: u64) {
-        self.bytes[at..at + 8].copy_from_slice(&value.to_le_bytes());
-    }
-
-    /// Where the table entry of the only section of a kind begins.
-    fn entry(&self, kind: u32) -> usize {
-        let count = self.u32(offset_of!(Header, sections)) as usize;
-        let mut entries = (0..count).map(|i| size_of::<Header>() + i * size_of::<Section>());
-        entries.find(|at| self.u32(at + offset_of!(Section, kind)) == kind).unwrap()
-    }
-
-    /// Where a section's chunks lie.
-    fn section(&self, kind: u32) -> Range<usize> {
-        let at = self.entry(kind);
-        let start = self.u64(at + offset_of!(Section, offset)) as usize;
-        start..start + self.u64(at + offset_of!(Section, stored_bytes)) as usize
-    }
-
-    /// Where the table entry of a section's last chunk begins.
-    fn last_chunk(&self, kind: u32) -> usize {
-        let at = self.entry(kind);
-        let last =
-            self.u32(at + offset_of!(Section, first_chunk)) + self.u32(at + offset_of!(Section, chunks)) - 1;
-        let tables =
-            size_of::<Header>() + self.u32(offset_of!(Header, sections)) as usize * size_of::<Section>();
-        tables + last as usize * size_of::<Chunk>()
-    }
-
-    /// Where word `word` of a grid's header in the tree lies.
-    fn grid(&self, grid: usize, word: usize) -> usize {
-        let tree = self.section(kind::TREE).start;
-        let grids = self.u32(tree + 4 * tree::header::GRID_AT) as usize;
-        tree + 4 * (grids + grid * tree::GRID_WORDS + word)
-    }
-
-    fn sealed(mut self) -> Vec<u8> {
-        reseal::reseal(&mut self.bytes);
-        self.bytes
-    }
-}
-
-/// Forgeries that mutations find rarely or not at all, each of which some reader has died of.
-#[test]
-fn a_forged_pack_is_refused() {
-    let packs = packs();
-    let refused = |name: &str, forge: &dyn Fn(&mut Forgery), why: &str| {
-        let mut forgery = Forgery::of(&packs, name);
-        forge(&mut forgery);
-        let bytes = forgery.sealed();
-        let error = pack_error(&bytes);
-        assert!(matches!(&error, PackError::Corrupt(what) if what.contains(why)), "{why:?}: {error}");
-        assert!(!entry::pack(bytes));
-    };
-    let level_set = "levelset_half_unorm8_0";
-    let two_grids = "anim_f32_0";
-
-    let short_raw_chunk = |pack: &mut Forgery| {
-        let (section, chunk) = (pack.entry(kind::TEXELS), pack.last_chunk(kind::TEXELS));
-        let at = section + offset_of!(Section, stored_bytes);
-        pack.set_u64(at, pack.u64(at) - 8);
-        let at = chunk + offset_of!(Chunk, stored_bytes);
-        pack.set_u32(at, pack.u32(at) - 8);
-    };
-    refused(level_set, &short_raw_chunk, "does not lie where it should");
-
-    let wrapping_offset = |pack: &mut Forgery| {
-        let (section, chunk) = (pack.entry(kind::TREE), pack.last_chunk(kind::TREE));
-        pack.set_u64(section + offset_of!(Section, offset), u64::MAX - 7);
-        pack.set_u64(chunk + offset_of!(Chunk, offset), u64::MAX - 7);
-    };
-    refused(level_set, &wrapping_offset, "begins behind the end");
-
-    let endless_box = |pack: &mut Forgery| {
-        for word in [tree::grid::CELLS, tree::grid::ROOTS] {
-            pack.set_u32(pack.grid(0, word), u32::MAX);
-        }
-    };
-    refused(level_set, &endless_box, "impossible header");
-
-    let no_frames = |pack: &mut Forgery| {
-        pack.set_u32(pack.section(kind::GRIDS).start + offset_of!(GridRecord, frames), 0);
-        pack.set_u32(pack.grid(0, tree::grid::FRAMES), 0);
-        pack.set_u32(pack.grid(0, tree::grid::ROOT_AT), u32::MAX);
-    };
-    refused(level_set, &no_frames, "impossible header");
-
-    let shared_name = |pack: &mut Forgery| {
-        let names = pack.section(kind::NAMES).len() as u32;
-        pack.set_u32(pack.section(kind::GRIDS).start + offset_of!(GridRecord, name_bytes), names);
-    };
-    refused(two_grids, &shared_name, "overlap");
-
-    let shared_list = |pack: &mut Forgery| {
-        let lists = pack.section(kind::FRAME_CHUNKS).len() as u32 / 4;
-        pack.set_u32(pack.section(kind::FRAMES).start + offset_of!(FrameRecord, chunks), lists);
-    };
-    refused(two_grids, &shared_list, "overlap");
-
-    let shared_roots = |pack: &mut Forgery| {
-        let words = pack.section(kind::TREE).len() as u32 / 4 - tree::HEADER_WORDS as u32;
-        for grid in 0..2 {
-            let frames = pack.u32(pack.grid(grid, tree::grid::FRAMES));
-            pack.set_u32(pack.grid(grid, tree::grid::ROOT_AT), tree::HEADER_WORDS as u32);
-            for axis in 0..3 {
-                pack.set_u32(pack.grid(grid, tree::grid::CELLS + axis), 32);
-                pack.set_u32(
-                    pack.grid(grid, tree::grid::ROOTS + axis),
-                    if axis == 0 { words / frames } else { 1 },
-                );
-            }
-        }
-    };
-    refused(two_grids, &shared_roots, "roots overlap");
-}
-
 #[test]
 fn a_summary_takes_any_count_of_leaves() {
-    let mut pack = Forgery::of(&packs(), "anim_f32_0");
-    let leaves = offset_of!(FrameRecord, leaves);
-    for frame in pack.section(kind::FRAMES).step_by(size_of::<FrameRecord>()) {
-        pack.set_u64(frame + leaves, u64::MAX / 2 + 1);
+    let packs = packs();
+    let mut pack = Forgery::new(packs.iter().find(|p| p.name == "anim_f32_0").unwrap().bytes.clone());
+    for frame in 0..6 {
+        pack.set(pack.frame(frame) + offset_of!(FrameRecord, leaves), u64::MAX / 2 + 1);
     }
-    let summary = PackSummary::new(&Pack::from_bytes(pack.sealed()).unwrap());
+    let summary = PackSummary::new(&Pack::from_bytes(pack.finish()).unwrap());
     assert_eq!(summary.source_leaves, u64::MAX);
 }
 

@@ -1,5 +1,6 @@
 """A second reader of .volpack files, written from docs/format.md alone. `volpack_reader.py PACK` prints a line of
-JSON for each frame of each grid. Python 3.9; zstandard where chunks are compressed, blake3 only if it is there."""
+JSON for each frame of each grid. `volpack_reader.py PACK EXPECTED` prints what the pack has where EXPECTED, a file of
+tests/conformance, asks for it. Python 3.9; zstandard where chunks are compressed, blake3 only if it is there."""
 import collections, ctypes, functools, importlib.util, itertools, json, math, pathlib, struct, sys, zlib
 
 blake3, zstd = (importlib.util.find_spec(n) and importlib.import_module(n) for n in ("blake3", "zstandard"))
@@ -143,23 +144,45 @@ class Pack:
         minus = masks[512:] if rule == 2 else [rule] * 512
         return [(v if a or rule == 3 else -back if m else back, bool(a)) for v, a, m in zip(values, active, minus)]
 
-    def voxel(self, grid_index, frame_index, xyz):
-        """The (value, active) of one voxel."""
-        grid = self.grids[grid_index]
-        at = [p - origin for p, origin in zip(xyz, grid.origin)]
+    @functools.lru_cache(None)
+    def brick(self, grid, frame, place):
+        """The 512 (value, active) of the 8 x 8 x 8 voxels from 8 * place on."""
+        at = [8 * p - origin for p, origin in zip(place, grid.origin)]
         node, cell = zip(*(divmod(a // 128, size) for a, size in zip(at, grid.cells)))
         if any(not 0 <= n < size for n, size in zip(node, grid.nodes)):
-            return grid.background, False
+            return [(grid.background, False)] * 512
         path = ravel(node, grid.nodes), ravel(cell, grid.cells), ravel([a // 8 % 16 for a in at], (16, 16, 16))
-        roots, cells, records = self.walk(grid, frame_index, path)
+        roots, cells, records = self.walk(grid, frame, path)
         if records:
-            return self.region(grid, records[0])[ravel([a % 8 for a in at])]
+            return self.region(grid, records[0])
         for link in roots + cells:
-            return self.reals[self.tree[9] + (link & 0x3FFFFFFF)], bool(link >> 30 & 1)
-        return grid.background, False
+            return [(self.reals[self.tree[9] + (link & 0x3FFFFFFF)], bool(link >> 30 & 1))] * 512
+        return [(grid.background, False)] * 512
+
+    def voxel(self, grid, frame, xyz):
+        """The (value, active) of one voxel."""
+        return self.brick(grid, frame, tuple(p // 8 for p in xyz))[ravel([p % 8 for p in xyz])]
+
+def fill(pack, wanted):
+    """Fills in what a pack has at the voxels and in the boxes that an expectation names."""
+    for frame in wanted["frames"]:
+        grid = next(grid for grid in pack.grids if grid.name == frame["grid"])
+        voxel = functools.partial(pack.voxel, grid, grid.frames.index(frame["frame"]))
+        for entry in frame["voxels"]:
+            value, active = voxel(entry[:3])
+            entry[3:] = [struct.pack(">f", value).hex(), active]
+        for box in frame["boxes"]:
+            ranges = (range(least, most + 1) for least, most in zip(box["min"], box["max"]))
+            voxels = [voxel(at) for at in itertools.product(*ranges)]
+            raw = struct.pack("<" + "fB" * len(voxels), *itertools.chain.from_iterable(voxels))
+            box.update(crc32=f"{zlib.crc32(raw):08x}", active=sum(active for _, active in voxels))
+    return wanted
 
 if __name__ == "__main__":
     pack = Pack(sys.argv[1])
+    if len(sys.argv) > 2:
+        text = json.dumps(fill(pack, json.loads(pathlib.Path(sys.argv[2]).read_text())))
+        sys.exit(print(text.replace("}, {", "},\n{").replace("[[", "[\n[").replace("], [", "],\n[")))
     for grid, (f, number) in ((grid, frame) for grid in pack.grids for frame in enumerate(grid.frames)):
         roots, cells, records = pack.walk(grid, f)
         regions = [pack.region(grid, record) for record in records]

@@ -72,6 +72,10 @@ pub fn pack(bytes: Vec<u8>) -> bool {
         Ok(()) => true,
         Err(error) => refused(&error),
     };
+    accepted &= match pack.provenance() {
+        Ok(_) => true,
+        Err(error) => refused(&error),
+    };
     let summary = PackSummary::new(&pack);
     for (g, grid) in pack.grids.iter().enumerate() {
         for f in 0..grid.frames.len() {

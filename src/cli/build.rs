@@ -10,7 +10,7 @@ use super::progress::Reporter;
 use super::style::{GOOD, TITLE};
 use super::{Common, outln, print_json};
 use crate::error::{Error, Result};
-use crate::pack::Pack;
+use crate::pack::{Pack, Provenance};
 use crate::pipeline::{Job, Made, Outcome, VerifyLevel, build};
 use crate::report::model::{Figures, Total};
 use crate::report::{Breach, Checked, of_total};
@@ -85,9 +85,11 @@ fn check(
     let pack = Pack::open(&job.output).map_err(Error::pack(&job.output))?;
     let found = outcome.verification.as_ref();
     let build = outcome.build_report();
-    let figures = Figures::new(&pack, &outcome.summary, found, Some(&build));
-    let build = Some(&build);
-    let checked = Checked { name, budget, figures: &figures, baseline: None, pack: &pack, found, build };
+    let Provenance { settings, sources, .. } = &pack.provenance().map_err(Error::provenance(&pack))?;
+    let figures = Figures::new(sources, &outcome.summary, found, Some(&build));
+    let (figures_of, build) = (&figures, Some(&build));
+    let checked =
+        Checked { name, budget, figures: figures_of, baseline: None, pack: &pack, settings, found, build };
     breaches.extend(checked.breaches());
     Ok(figures)
 }

@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::style::TITLE;
+use super::style::{ERROR, TITLE};
 use super::{outln, print_json};
 use crate::error::{Error, Result};
 use crate::pack::{Pack, layout};
@@ -94,15 +94,19 @@ fn print_grid(g: &GridSummary) {
 }
 
 fn print_pack(path: &Path, pack: &Pack, summary: &PackSummary) {
-    let p = &pack.provenance;
+    let (by, unreadable) = match pack.provenance() {
+        Ok(provenance) => (format!(", by {} {}", provenance.tool, provenance.version), None),
+        Err(error) => (String::new(), Some(error)),
+    };
     outln!(
-        "{TITLE}{}{TITLE:#}: {}, pack format {}, by {} {}",
+        "{TITLE}{}{TITLE:#}: {}, pack format {}{by}",
         path.display(),
         bytes(summary.file_bytes),
-        layout::VERSION,
-        p.tool,
-        p.version
+        layout::VERSION
     );
+    if let Some(error) = unreadable {
+        outln!("  {ERROR}{error}{ERROR:#}");
+    }
     for grid in &pack.grids {
         let r = &grid.record;
         let numbers: Vec<i32> = grid.frames.iter().map(|f| f.record.number).collect();

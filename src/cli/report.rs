@@ -168,30 +168,34 @@ impl Gathering<'_> {
                 return Err(Error::Verify(format!("verification failed: {}", report.failures.join("; "))));
             }
             let pack = Pack::open(&job.output).map_err(Error::pack(&job.output))?;
-            let figures = Figures::new(&pack, &outcome.summary, outcome.verification.as_ref(), None);
+            let provenance = pack.provenance().map_err(Error::provenance(&pack))?;
+            let figures =
+                Figures::new(&provenance.sources, &outcome.summary, outcome.verification.as_ref(), None);
             if self.args.no_cheaper {
-                return Ok((outcome, pack, None, None));
+                return Ok((outcome, pack, provenance, None, None));
             }
             reporter.finish();
             reporter = Reporter::new(&format!("{name}, cheaper"), self.common.quiet);
             match cheaper(job, &pack, &figures, &mut reporter) {
-                Ok(cheaper) => Ok((outcome, pack, cheaper, None)),
+                Ok(cheaper) => Ok((outcome, pack, provenance, cheaper, None)),
                 Err(Error::Interrupted) => Err(Error::Interrupted),
                 // A size that cannot be reached is no offer.
-                Err(Error::Usage(_)) => Ok((outcome, pack, None, None)),
+                Err(Error::Usage(_)) => Ok((outcome, pack, provenance, None, None)),
                 Err(error) => {
-                    Ok((outcome, pack, None, Some(format!("no cheaper setting was measured: {error}"))))
+                    let trouble = format!("no cheaper setting was measured: {error}");
+                    Ok((outcome, pack, provenance, None, Some(trouble)))
                 }
             }
         });
         reporter.finish();
-        let (outcome, pack, cheaper, trouble) = made?;
+        let (outcome, pack, provenance, cheaper, trouble) = made?;
         let build = outcome.build_report();
         let Outcome { mut warnings, summary, verification, .. } = outcome;
         warnings.extend(trouble);
         let reported = Reported {
             name,
             pack: &pack,
+            provenance: &provenance,
             file: &job.output,
             digest: digest(&job.output)?.0,
             summary,
@@ -212,6 +216,7 @@ impl Gathering<'_> {
     /// Reports a pack that is there.
     fn look(&mut self, name: &str, path: &Path, sources: &[PathBuf]) -> Result<AssetReport> {
         let pack = check_structure(path)?;
+        let provenance = pack.provenance().map_err(Error::provenance(&pack))?;
         let mut reporter = Reporter::new(name, self.common.quiet);
         let files = (!sources.is_empty()).then_some(sources);
         let pictures = PictureSettings::default();
@@ -227,6 +232,7 @@ impl Gathering<'_> {
         let reported = Reported {
             name,
             pack: &pack,
+            provenance: &provenance,
             file: path,
             digest: digest(path)?.0,
             summary: PackSummary::new(&pack),

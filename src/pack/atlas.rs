@@ -46,8 +46,8 @@ impl Atlas {
 
     /// The slots of the bricks in a slab.
     pub fn slots(&self, slab: u32) -> Range<u32> {
-        let start = slab * self.slab_bricks();
-        start..(start + self.slab_bricks()).min(self.bricks)
+        let start = slab.saturating_mul(self.slab_bricks()).min(self.bricks);
+        start..start.saturating_add(self.slab_bricks()).min(self.bricks)
     }
 
     /// Copies one brick's bytes out of a slab.

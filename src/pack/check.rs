@@ -1,17 +1,51 @@
 //! Structural checks: every offset, index, count and rank of the tree and the tables.
+//!
+//! Numbers of rules are those of `docs/format.md`, "What a reader checks".
 
-use std::collections::HashSet;
 use std::ops::Range;
 
-use super::error::corrupt;
-use super::layout::GridRecord;
+use super::error::{corrupt, ensure};
+use super::layout::{FrameRecord, GridRecord};
 use super::tree::{
     self, GRID_WORDS, HEADER_WORDS, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS, grid, header,
     l1_words,
 };
 use super::{Grid, Pack, PackError};
-use crate::codec::{Codec, SequenceRange};
+use crate::codec::{BrickRange, Codec, SequenceRange};
 use crate::volume::{CELL_DIM, Coord, InactiveRule};
+
+/// So many entries of a table from the first on.
+pub(super) fn range(first: u32, count: u32) -> Range<usize> {
+    first as usize..first as usize + count as usize
+}
+
+/// Rules 32, 33 and 40: parts of a table lie inside it, and none serves twice. Were the same entries to serve many, a
+/// small file could take all memory or any time.
+pub(super) fn parts(
+    parts: impl Iterator<Item = Range<usize>>,
+    len: usize,
+    what: &str,
+) -> Result<(), PackError> {
+    let mut parts: Vec<_> = parts.collect();
+    ensure(parts.iter().all(|part| part.end <= len), || format!("{what} lie outside their table"))?;
+    parts.retain(|part| !part.is_empty());
+    parts.sort_unstable_by_key(|part| part.start);
+    ensure(parts.windows(2).all(|pair| pair[0].end <= pair[1].start), || format!("{what} overlap"))
+}
+
+/// Rules 34 and 35, once frames are known to lie inside their table.
+pub(super) fn frame_order(grids: &[GridRecord], frames: &[FrameRecord]) -> Result<(), PackError> {
+    let place = |frame: &FrameRecord| (frame.grid, frame.number);
+    ensure(frames.is_sorted_by(|a, b| place(a) < place(b)), || {
+        "the frame table is not ordered by grid and number".to_owned()
+    })?;
+    let in_grids: u64 = grids.iter().map(|grid| u64::from(grid.frames)).sum();
+    let mut own = grids.iter().map(|grid| &frames[range(grid.first_frame, grid.frames)]).enumerate();
+    let are_own = own.all(|(g, frames)| frames.iter().all(|frame| frame.grid as usize == g));
+    ensure(are_own && in_grids == frames.len() as u64, || {
+        "the frame table and the grid table disagree about whose a frame is".to_owned()
+    })
+}
 
 /// The words of the tree that a header entry names.
 fn area(words: &[u32], at: usize, count: usize, size: usize, what: &str) -> Result<Range<usize>, PackError> {
@@ -23,45 +57,45 @@ fn area(words: &[u32], at: usize, count: usize, size: usize, what: &str) -> Resu
     }
 }
 
-/// Checks the tree's header, L2 nodes, L3 records and, for each grid, L1 nodes.
+/// Checks the tree's header, L3 records and L2 nodes: rules 22, 23 and 25 to 31.
 pub(super) fn tree(pack: &Pack) -> Result<(), PackError> {
     let words = &pack.tree;
     if words.len() < HEADER_WORDS || words[header::WORDS] as usize != words.len() {
         return corrupt("the tree is not as long as it says");
     }
     let count = |at: usize| words[at] as usize;
-    let grids = area(words, header::GRID_AT, count(header::GRIDS), GRID_WORDS, "grids")?;
+    area(words, header::GRID_AT, count(header::GRIDS), GRID_WORDS, "grids")?;
     let nodes = area(words, header::NODE_AT, count(header::NODES), NODE_WORDS, "L2 nodes")?;
     let records = area(words, header::RECORD_AT, count(header::RECORDS), RECORD_WORDS, "L3 records")?;
     area(words, header::MASK_AT, count(header::MASKS), MASK_WORDS, "masks")?;
     area(words, header::CONSTANT_AT, count(header::CONSTANTS), 1, "constants")?;
-    if grids.is_empty() {
-        return corrupt("there is no grid");
-    }
     for codec in Codec::WITH_TEXELS {
         let atlas = pack.atlas(codec).map_or([0; 3], |a| [a.columns, a.rows, a.page_slabs]);
-        if words[header::atlas(codec)..][..3] != atlas {
-            return corrupt(format!("the tree and the atlas table disagree about {}", codec.name()));
-        }
+        ensure(words[header::atlas(codec)..][..3] == atlas, || {
+            format!("the tree and the atlas table disagree about {}", codec.name())
+        })?;
     }
     for (i, record) in words[records.clone()].chunks_exact(RECORD_WORDS).enumerate() {
-        check_record(pack, record, count(header::MASKS))
+        l3_record(pack, record, count(header::MASKS))
             .map_err(|what| PackError::Corrupt(format!("L3 record {i}: {what}")))?;
     }
     for (i, node) in words[nodes].chunks_exact(NODE_WORDS).enumerate() {
         let (mask, ranks, first) = (&node[..128], &node[128..192], node[192] as usize);
-        let children: usize = mask.iter().map(|w| w.count_ones() as usize).sum();
-        if tree::ranks(mask) != ranks {
-            return corrupt(format!("L2 node {i} has wrong ranks"));
-        }
-        if first + children > count(header::RECORDS) {
-            return corrupt(format!("L2 node {i} has children outside the L3 records"));
-        }
+        ensure(tree::ranks(mask) == ranks, || format!("L2 node {i} has wrong ranks"))?;
+        ensure(first + ones(mask) <= count(header::RECORDS), || {
+            format!("L2 node {i} has children outside the L3 records")
+        })?;
     }
     Ok(())
 }
 
-fn check_record(pack: &Pack, words: &[u32], masks: usize) -> Result<(), String> {
+/// How many bits are on.
+fn ones(mask: &[u32]) -> usize {
+    mask.iter().map(|word| word.count_ones() as usize).sum()
+}
+
+/// Rules 26 to 29.
+fn l3_record(pack: &Pack, words: &[u32], masks: usize) -> Result<(), String> {
     let record = L3Record::from_words([words[0], words[1], words[2]]).ok_or("unknown codec")?;
     if let Some(mask) = record.mask {
         let used = if record.rule == InactiveRule::Sign { 2 } else { 1 };
@@ -78,23 +112,19 @@ fn check_record(pack: &Pack, words: &[u32], masks: usize) -> Result<(), String> 
     if record.slot >= atlas.bricks {
         return Err(format!("brick {} of {}", record.slot, atlas.bricks));
     }
-    if record.axis > 2 || record.codec != Codec::Bc7 && record.axis != 2 {
+    let axes = if record.codec == Codec::Bc7 { 0..=2 } else { 2..=2 };
+    if !axes.contains(&record.axis) {
         return Err(format!("packing axis {}", record.axis));
     }
-    let range = crate::codec::BrickRange::from_word(record.word2);
-    if !(range.extent.is_finite() && range.extent.to_f32() >= 0.0) {
-        return Err(format!("extent {}", range.extent));
+    let extent = BrickRange::from_word(record.word2).extent;
+    if !(extent.is_finite() && extent.to_f32() >= 0.0) {
+        return Err(format!("extent {extent}"));
     }
     Ok(())
 }
 
-/// Reads and checks the tree's header of one grid.
-pub(super) fn grid_header(
-    words: &[u32],
-    index: usize,
-    record: GridRecord,
-    name: &str,
-) -> Result<Grid, PackError> {
+/// Reads and checks what the tables and the tree's header say of one grid: rules 36 to 39.
+pub(super) fn grid(words: &[u32], index: usize, record: GridRecord, name: &str) -> Result<Grid, PackError> {
     let at = words[header::GRID_AT] as usize + index * GRID_WORDS;
     let h = &words[at..at + GRID_WORDS];
     let three = |at: usize| [h[at], h[at + 1], h[at + 2]];
@@ -110,78 +140,90 @@ pub(super) fn grid_header(
         roots: three(grid::ROOTS),
         root_at: h[grid::ROOT_AT] as usize,
     };
-    let one_root = grid.roots == [1; 3];
-    let cells_fit = grid.cells.iter().all(|c| (1..=32).contains(c)) && (one_root || grid.cells == [32; 3]);
-    let extent = |a: usize| i64::from(grid.cells[a]) * i64::from(grid.roots[a]) * i64::from(CELL_DIM);
-    // Wrong cells could make the extent wrap.
-    let box_fits = cells_fit
-        && (0..3).all(|a| {
-            grid.roots[a] >= 1 && i64::from(grid.origin.0[a]) + extent(a) <= i64::from(i32::MAX) + 1
-        });
-    let roots = grid.roots.iter().try_fold(u64::from(h[grid::FRAMES]), |n, r| n.checked_mul((*r).into()));
-    // A grid without frames has no roots, but they too begin inside.
-    let room = words.len().checked_sub(grid.root_at);
-    let roots_fit = roots.zip(room).is_some_and(|(roots, room)| roots <= room as u64);
-    if !box_fits || !roots_fit || !grid.origin.is_aligned(CELL_DIM) || h[grid::FRAMES] != record.frames {
-        return corrupt(format!("grid {name:?} has an impossible header"));
-    }
-    if !(grid.sequence.lo.is_finite() && grid.sequence.span.is_finite() && grid.sequence.span > 0.0) {
-        return corrupt(format!("grid {name:?} has an impossible range"));
-    }
+    let GridRecord { active_min, active_max, .. } = record;
+    ensure(active_min.is_finite() && active_max.is_finite() && active_min <= active_max, || {
+        format!("grid {name:?} has an impossible range of active values")
+    })?;
+    let is_sound = grid.origin.is_aligned(CELL_DIM)
+        && grid.cells.iter().all(|c| (1..=32).contains(c))
+        && grid.roots.iter().all(|r| *r >= 1)
+        && (grid.roots == [1; 3] || grid.has_whole_roots());
+    let end = |a: usize| {
+        i64::from(grid.origin.0[a])
+            + i64::from(grid.cells[a]) * i64::from(grid.roots[a]) * i64::from(CELL_DIM)
+    };
+    // Unsound cells could make the product wrap.
+    ensure(is_sound && (0..3).all(|a| end(a) <= i64::from(i32::MAX) + 1), || {
+        format!("grid {name:?} has an impossible box")
+    })?;
+    let SequenceRange { lo, span } = grid.sequence;
+    ensure(lo.is_finite() && span.is_finite() && span > 0.0, || {
+        format!("grid {name:?} has an impossible lo or span")
+    })?;
+    ensure(h[grid::FRAMES] == record.frames, || {
+        format!("the tree and the grid table disagree about the frames of grid {name:?}")
+    })?;
+    // Numbers of roots whose product would wrap do not fit either.
+    let frames = u64::from(record.frames);
+    let roots = grid.roots.iter().try_fold(frames, |n, r| n.checked_mul((*r).into()));
+    let room = words.len().checked_sub(grid.root_at).filter(|_| grid.root_at >= HEADER_WORDS);
+    ensure(roots.zip(room).is_some_and(|(roots, room)| roots <= room as u64), || {
+        format!("grid {name:?} has roots outside the tree")
+    })?;
     Ok(grid)
 }
 
-/// Checks each grid's roots and L1 nodes, and that its frames' chunk lists name texel chunks.
-pub(super) fn grids(pack: &Pack) -> Result<(), PackError> {
-    let words = &pack.tree;
-    let constants = words[header::CONSTANTS];
-    let nodes = words[header::NODES];
-    // No root serves twice, or a small file could take any time to check.
-    let all_roots = pack.grids.iter().map(|g| g.root_count() * g.frames.len()).sum::<usize>();
-    if all_roots > words.len() {
-        return corrupt("the grids' roots overlap");
-    }
-    for grid in &pack.grids {
-        let cells = grid.cell_count();
-        let roots = grid.root_count() * grid.frames.len();
-        let mut seen = HashSet::new();
-        for &word in &words[grid.root_at..grid.root_at + roots] {
-            match Link::from_word(word) {
-                Link::Node(0) => {}
-                Link::Constant { index, .. } if index < constants => {}
-                Link::Node(at) => {
-                    if seen.insert(at) {
-                        check_l1(words, at as usize, cells, nodes, constants).map_err(|what| {
-                            PackError::Corrupt(format!("grid {:?}, L1 node at word {at}: {what}", grid.name))
-                        })?;
-                    }
-                }
-                Link::Constant { index, .. } => {
-                    return corrupt(format!("root constant {index} of {constants}"));
-                }
-            }
-        }
-        for frame in &grid.frames {
-            if frame.chunks.iter().any(|&c| c as usize >= pack.chunk_count()) || !frame.chunks.is_sorted() {
-                return corrupt(format!(
-                    "grid {:?} frame {} lists chunks that are not there",
-                    grid.name, frame.record.number
-                ));
-            }
-            if frame.record.transform.iter().any(|v| !v.is_finite()) {
-                return corrupt(format!(
-                    "grid {:?} frame {} has no valid transform",
-                    grid.name, frame.record.number
-                ));
-            }
-        }
+/// Rules 41 and 42.
+pub(super) fn frames(pack: &Pack) -> Result<(), PackError> {
+    for (grid, frame) in pack.grids.iter().flat_map(|grid| grid.frames.iter().map(move |frame| (grid, frame)))
+    {
+        let what = |what: &str| format!("grid {:?} frame {} {what}", grid.name, frame.record.number);
+        let are_texels = frame.chunks.iter().all(|&chunk| pack.texels_of(chunk).is_some());
+        ensure(are_texels && frame.chunks.is_sorted_by(|a, b| a < b), || {
+            what("lists chunks that are not texels, or out of order")
+        })?;
+        ensure(frame.record.transform.iter().all(|v| v.is_finite()), || what("has no valid transform"))?;
     }
     Ok(())
 }
 
-fn check_l1(words: &[u32], at: usize, cells: usize, nodes: u32, constants: u32) -> Result<(), String> {
+/// Checks each grid's roots and the L1 nodes that they name: rules 43 to 46.
+pub(super) fn l1_nodes(pack: &Pack) -> Result<(), PackError> {
+    let words = &pack.tree;
+    let mut nodes: Vec<(u32, u32)> = Vec::new();
+    for grid in &pack.grids {
+        for &root in &words[grid.root_words()] {
+            match Link::from_word(root) {
+                Link::Node(0) => {}
+                Link::Node(at) => nodes.push((at, grid.cell_count() as u32)),
+                Link::Constant { index, .. } => {
+                    ensure(index < words[header::CONSTANTS] && grid.has_whole_roots(), || {
+                        format!("grid {:?} has a root that is no constant", grid.name)
+                    })?;
+                }
+            }
+        }
+    }
+    // Each is checked once, however many places, frames and grids share it. None begins inside another, or a small file
+    // could have as many large ones as it has words.
+    nodes.sort_unstable();
+    nodes.dedup();
+    let (mut last, mut end) = (0, HEADER_WORDS);
+    for (at, cells) in nodes {
+        let what = |what: String| PackError::Corrupt(format!("L1 node at word {at}: {what}"));
+        if at != last && (at as usize) < end {
+            return Err(what("it overlaps what is before it".to_owned()));
+        }
+        end = end.max(l1_node(words, at as usize, cells as usize).map_err(what)?);
+        last = at;
+    }
+    Ok(())
+}
+
+/// Rules 44 to 46 for one L1 node. Returns the word behind it.
+fn l1_node(words: &[u32], at: usize, cells: usize) -> Result<usize, String> {
     let (mask_words, rank_words) = l1_words(cells);
-    let Some(head) = words.get(at..at + mask_words + rank_words).filter(|_| at >= HEADER_WORDS) else {
+    let Some(head) = words.get(at..at + mask_words + rank_words) else {
         return Err("it lies outside the tree".to_owned());
     };
     let (mask, ranks) = head.split_at(mask_words);
@@ -191,17 +233,16 @@ fn check_l1(words: &[u32], at: usize, cells: usize, nodes: u32, constants: u32) 
     if !cells.is_multiple_of(32) && mask[mask_words - 1] >> (cells % 32) != 0 {
         return Err("children outside its cells".to_owned());
     }
-    let children: usize = mask.iter().map(|w| w.count_ones() as usize).sum();
-    let first = at + mask_words + rank_words;
-    let Some(links) = words.get(first..first + children) else {
+    let first = at + head.len();
+    let Some(links) = words.get(first..first + ones(mask)) else {
         return Err("its children lie outside the tree".to_owned());
     };
     for &word in links {
         match Link::from_word(word) {
-            Link::Node(node) if node < nodes => {}
-            Link::Constant { index, .. } if index < constants => {}
+            Link::Node(node) if node < words[header::NODES] => {}
+            Link::Constant { index, .. } if index < words[header::CONSTANTS] => {}
             link => return Err(format!("a child is {link:?}")),
         }
     }
-    Ok(())
+    Ok(first + links.len())
 }

@@ -3,6 +3,8 @@
 use std::borrow::Cow;
 use std::collections::HashMap;
 
+use super::error::ensure;
+use super::tables::fits_memory;
 use super::tree::{self, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS, header, l1_words};
 use super::{Atlas, Frame, Grid, Pack, PackError};
 use crate::codec::{BrickRange, Codec, decode, spread};
@@ -41,23 +43,20 @@ impl Pack {
     /// Loads one frame's texels.
     ///
     /// # Errors
-    /// When a chunk is damaged or is not texels.
+    /// When a chunk is damaged.
     ///
     /// # Panics
     /// When there is no such frame.
     pub fn frame(&self, grid: usize, frame: usize) -> Result<FrameReader<'_>, PackError> {
-        let mut slabs = HashMap::new();
-        let wanted = &self.grids[grid].frames[frame].chunks;
-        for atlas in &self.atlases {
-            for slab in 0..atlas.slabs {
-                let (_, chunk) = self.slab_chunk(atlas.codec, slab).expect("the atlas was checked");
-                if wanted.binary_search(&(chunk as u32)).is_ok() {
-                    slabs.insert(chunk, self.slab(atlas.codec, slab)?);
-                }
-            }
-        }
-        if slabs.len() != wanted.len() {
-            return Err(PackError::Corrupt(format!("frame {frame} lists chunks that are not texels")));
+        let chunks = &self.grids[grid].frames[frame].chunks;
+        let bytes = chunks.iter().map(|&chunk| self.chunk_bytes(chunk));
+        let (raw, stored) = bytes.fold((0, 0), |(raw, stored), (r, s)| (raw + r, stored + s));
+        // Rule 14.
+        ensure(fits_memory(raw, stored), || format!("frame {frame} claims to unpack to {raw} bytes"))?;
+        let mut slabs = HashMap::with_capacity(chunks.len());
+        for &chunk in chunks {
+            let section = self.texels_of(chunk).expect("chunk lists were checked when the pack was opened");
+            slabs.insert(chunk as usize, self.chunk(section, chunk as usize)?);
         }
         Ok(FrameReader { pack: self, grid, frame, slabs })
     }
@@ -83,13 +82,13 @@ impl Pack {
         let in_node: Vec<u64> =
             nodes.take(words[header::NODES] as usize).map(|node| ones(&node[..128])).collect();
         let mut total = 0u64;
+        let mut in_l1: HashMap<(u32, usize), u64> = HashMap::new();
         for grid in &self.grids {
-            let (mask_words, rank_words) = l1_words(grid.cell_count());
-            let mut in_l1: HashMap<u32, u64> = HashMap::new();
-            let roots = grid.root_count() * grid.frames.len();
-            for &root in &words[grid.root_at..grid.root_at + roots] {
+            let cells = grid.cell_count();
+            let (mask_words, rank_words) = l1_words(cells);
+            for &root in &words[grid.root_words()] {
                 let Link::Node(l1 @ 1..) = Link::from_word(root) else { continue };
-                let count = in_l1.entry(l1).or_insert_with(|| {
+                let count = in_l1.entry((l1, cells)).or_insert_with(|| {
                     let (mask, rest) = words[l1 as usize..].split_at(mask_words);
                     let links = rest[rank_words..].iter().take(ones(mask) as usize);
                     let nodes = links.map(|&link| match Link::from_word(link) {
@@ -125,7 +124,7 @@ impl FrameReader<'_> {
         tree::constant(words[words[header::CONSTANT_AT] as usize + index as usize], active)
     }
 
-    /// What the tree has at a voxel, and the side of the aligned cube around it that all is that.
+    /// What the tree has at a voxel, and the side of an aligned cube around it that is all that.
     pub fn locate(&self, at: Coord) -> (Region, i32) {
         let grid = self.grid();
         let mut root = 0usize;
@@ -135,7 +134,7 @@ impl FrameReader<'_> {
             let (cells, roots) = (i64::from(grid.cells[a]), i64::from(grid.roots[a]));
             let index = offset.div_euclid(CELL_DIM.into());
             if index < 0 || index >= cells * roots {
-                return (Region::Background, ROOT_DIM);
+                return (Region::Background, self.outside_dim(at));
             }
             root = root * roots as usize + (index / cells) as usize;
             cell = cell * cells as usize + (index % cells) as usize;
@@ -155,6 +154,19 @@ impl FrameReader<'_> {
             Link::Constant { index, active } => (Region::Constant(self.constant(index, active)), CELL_DIM),
             Link::Node(node) => (self.child(node, at.child_index(4, BRICK_DIM)), BRICK_DIM),
         }
+    }
+
+    /// The side of an aligned cube around a voxel outside the grid's box that is all outside.
+    fn outside_dim(&self, at: Coord) -> i32 {
+        let grid = self.grid();
+        let root = at.align_down(ROOT_DIM);
+        let is_apart = |a: usize| {
+            let [origin, root] = [grid.origin, root].map(|corner| i64::from(corner.0[a]));
+            let extent = i64::from(grid.cells[a]) * i64::from(grid.roots[a]) * i64::from(CELL_DIM);
+            root + i64::from(ROOT_DIM) <= origin || origin + extent <= root
+        };
+        // The box is made of whole cells.
+        if (0..3).any(is_apart) { ROOT_DIM } else { CELL_DIM }
     }
 
     fn child(&self, node: u32, index: usize) -> Region {
@@ -190,7 +202,9 @@ impl FrameReader<'_> {
         let roots = (0..rx).flat_map(|x| (0..ry).flat_map(move |y| (0..rz).map(move |z| [x, y, z])));
         let root_count = grid.root_count();
         for (i, root) in roots.enumerate() {
-            let origin = grid.origin.offset_by(std::array::from_fn(|a| root[a] as i32 * ROOT_DIM));
+            // A box from one end of i32 to the other has offsets past its range, but no corners.
+            let corner = |a: usize| i64::from(grid.origin.0[a]) + i64::from(root[a]) * i64::from(ROOT_DIM);
+            let origin = Coord(std::array::from_fn(|a| corner(a) as i32));
             let l1 = match Link::from_word(words[grid.root_at + self.frame * root_count + i]) {
                 Link::Node(0) => continue,
                 Link::Constant { index, active } => {
@@ -273,6 +287,7 @@ impl FrameReader<'_> {
         Ok(spread(record.codec, &self.texels(record)?, &self.grid().sequence, range))
     }
 
+    /// Rule 47.
     fn texels(&self, record: &L3Record) -> Result<Vec<u8>, PackError> {
         let atlas = self.pack.atlas(record.codec).expect("records were checked when the pack was opened");
         let (slab, place) = (record.slot / atlas.slab_bricks(), record.slot % atlas.slab_bricks());

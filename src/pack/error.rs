@@ -43,3 +43,8 @@ impl PackError {
 pub(super) fn corrupt<T>(what: impl Into<String>) -> Result<T, PackError> {
     Err(PackError::Corrupt(what.into()))
 }
+
+/// An error if a rule of the format does not hold.
+pub(super) fn ensure(holds: bool, what: impl FnOnce() -> String) -> Result<(), PackError> {
+    if holds { Ok(()) } else { corrupt(what()) }
+}

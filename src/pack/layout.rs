@@ -88,6 +88,16 @@ pub mod kind {
     pub const TEXELS: u32 = 7;
     pub const PROVENANCE: u32 = 8;
 
+    /// The kinds that a pack has exactly one section of.
+    pub const ALONE: [u32; 7] = [GRIDS, FRAMES, NAMES, ATLASES, FRAME_CHUNKS, TREE, PROVENANCE];
+    /// Those of them that are read when a pack is opened.
+    pub const READ_BY_OPEN: [u32; 6] = [GRIDS, FRAMES, NAMES, ATLASES, FRAME_CHUNKS, TREE];
+
+    /// Whether this version of the format has a meaning for it.
+    pub fn is_known(kind: u32) -> bool {
+        (GRIDS..=PROVENANCE).contains(&kind)
+    }
+
     /// A kind's name for messages.
     pub fn name(kind: u32) -> &'static str {
         const NAMES: [&str; 9] = [

@@ -17,7 +17,7 @@ mod writer;
 pub use atlas::{Atlas, MAX_TEXELS};
 pub use decode::{DecodedBrick, FrameReader, Region};
 pub use error::PackError;
-pub use provenance::{Provenance, Source};
+pub use provenance::{Provenance, ProvenanceError, Source};
 pub use reader::{Frame, Grid, Pack};
 pub use repack::repack;
 pub use writer::{FinishedPack, PackWriter, SectionSpec, compress_chunk};

@@ -2,34 +2,31 @@
 
 use std::borrow::Cow;
 use std::fs::File;
-use std::path::Path;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use bytemuck::Pod;
 use bytemuck::allocation::zeroed_vec;
 use memmap2::Mmap;
 
-use super::atlas::Atlas;
-use super::error::corrupt;
+use super::atlas::{Atlas, MAX_TEXELS};
+use super::error::{corrupt, ensure};
 use super::layout::{AtlasRecord, Chunk, FrameRecord, GridRecord, Section, encoding, kind};
-use super::tables::{chunk_range, read_tables};
-use super::{PackError, Provenance, check};
+use super::tables::{chunk_range, fits_memory, read_tables};
+use super::tree::header;
+use super::{PackError, Provenance, ProvenanceError, check};
 use crate::codec::{Codec, SequenceRange};
-use crate::settings::Settings;
 use crate::vdb::{GridClass, voxel_size};
-use crate::volume::{Coord, ValueRange};
-
-/// A section that is read whole may not grow more than this in decoding, so that a small file cannot
-/// take all memory. Trees shrink 2 to 10 times.
-const MAX_EXPANSION: u64 = 512;
-/// Sections up to this size are read whatever they were packed to.
-const SMALL_SECTION: u64 = 1 << 24;
+use crate::volume::{Coord, ROOT_DIM, ValueRange};
 
 /// An open pack.
 ///
 /// Opening checks the tables, and that every index in them and in the tree lies inside what it
-/// points into. Texel chunks are checked when they are first read.
+/// points into. Texel chunks are checked when they are first read. `docs/format.md`, "What a reader checks",
+/// numbers the rules.
 pub struct Pack {
+    path: PathBuf,
     bytes: Bytes,
     /// The grids.
     pub grids: Vec<Grid>,
@@ -37,8 +34,6 @@ pub struct Pack {
     pub tree: Vec<u32>,
     /// The texture pages, one entry a codec that is used.
     pub atlases: Vec<Atlas>,
-    /// Where the pack comes from.
-    pub provenance: Provenance,
     pub(super) sections: Vec<Section>,
     chunks: Vec<Chunk>,
     /// The texel section's place for each of `atlases`.
@@ -94,6 +89,16 @@ pub struct Frame {
 }
 
 impl Grid {
+    /// The words of the tree that link to its frames' L1 nodes.
+    pub(super) fn root_words(&self) -> Range<usize> {
+        self.root_at..self.root_at + self.root_count() * self.record.frames as usize
+    }
+
+    /// Whether each of its L1 nodes covers a cube that OpenVDB has a root entry for, so that one value may stand for it.
+    pub(super) fn has_whole_roots(&self) -> bool {
+        self.cells == [32; 3] && self.origin.is_aligned(ROOT_DIM)
+    }
+
     /// L1 nodes of a frame.
     pub(super) fn root_count(&self) -> usize {
         self.roots.iter().map(|r| *r as usize).product()
@@ -132,7 +137,7 @@ impl Pack {
         // SAFETY: the map is only read. Another process that cuts the file short while it is mapped
         // can kill this one with SIGBUS; packs are replaced by renaming, never written in place.
         let map = unsafe { Mmap::map(&file)? };
-        Self::parse(Bytes::Mapped(map))
+        Self::parse(path.to_owned(), Bytes::Mapped(map))
     }
 
     /// The same for a pack that is in memory.
@@ -140,111 +145,132 @@ impl Pack {
     /// # Errors
     /// [`PackError`].
     pub fn from_bytes(bytes: Vec<u8>) -> Result<Self, PackError> {
-        Self::parse(Bytes::Memory(bytes))
+        Self::parse(PathBuf::from("(in memory)"), Bytes::Memory(bytes))
     }
 
-    fn parse(bytes: Bytes) -> Result<Self, PackError> {
+    /// The file that it was opened from, for messages.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Where the pack comes from. It is read when it is asked for, since no voxel depends on it.
+    ///
+    /// # Errors
+    /// [`ProvenanceError`].
+    pub fn provenance(&self) -> Result<Provenance, ProvenanceError> {
+        let section = self.section(kind::PROVENANCE)?;
+        ensure(fits_memory(section.raw_bytes, section.stored_bytes), || {
+            format!("the provenance claims to unpack to {} bytes", section.raw_bytes) // Rule 14.
+        })?;
+        Provenance::from_json(&self.records(kind::PROVENANCE)?)
+    }
+
+    fn parse(path: PathBuf, bytes: Bytes) -> Result<Self, PackError> {
         let (sections, chunks) = read_tables(&bytes)?;
         let mut pack = Self {
             checked: chunks.iter().map(|_| AtomicBool::new(false)).collect(),
+            path,
             bytes,
             grids: Vec::new(),
             tree: Vec::new(),
             atlases: Vec::new(),
-            provenance: Provenance {
-                tool: String::new(),
-                version: String::new(),
-                encoder_isa: None,
-                settings: Settings::default(),
-                sources: Vec::new(),
-            },
             sections,
             chunks,
             texel_sections: Vec::new(),
         };
+        pack.check_sections()?;
+        pack.read_atlases()?;
         pack.tree = pack.records(kind::TREE)?;
-        let provenance: Vec<u8> = pack.records(kind::PROVENANCE)?;
-        pack.provenance = serde_json::from_slice(&provenance)
-            .map_err(|e| PackError::Corrupt(format!("the provenance is not its JSON: {e}")))?;
-        for record in pack.records::<AtlasRecord>(kind::ATLASES)? {
-            let (atlas, section) = pack.read_atlas(&record)?;
-            pack.atlases.push(atlas);
-            pack.texel_sections.push(section);
-        }
         check::tree(&pack)?;
         pack.grids = pack.read_grids()?;
-        check::grids(&pack)?;
+        check::frames(&pack)?;
+        check::l1_nodes(&pack)?;
         Ok(pack)
     }
 
-    fn read_atlas(&self, record: &AtlasRecord) -> Result<(Atlas, usize), PackError> {
-        let Some(codec) = Codec::from_tag(record.codec).filter(|c| *c != Codec::Constant) else {
-            return corrupt(format!("an atlas has the unknown codec {}", record.codec));
-        };
-        if self.atlases.iter().any(|a| a.codec == codec) {
-            return corrupt(format!("two atlases are {}", codec.name()));
+    /// Rules 13 and 14.
+    fn check_sections(&self) -> Result<(), PackError> {
+        for kind in kind::ALONE {
+            self.section(kind)?;
         }
-        let &AtlasRecord { bricks, columns, rows, slabs, page_slabs, .. } = record;
-        let section = self.sections.iter().position(|s| s.kind == kind::TEXELS && s.codec == record.codec);
-        let Some(section) = section else {
-            return corrupt(format!("there are no texels for the {} atlas", codec.name()));
-        };
-        let atlas = Atlas { codec, bricks, columns, rows, slabs, page_slabs };
-        let fits = (1..=256).contains(&columns)
-            && (1..=256).contains(&rows)
-            && page_slabs > 0
-            && page_slabs as usize * codec.layout().slices <= super::MAX_TEXELS as usize
-            && u64::from(bricks) <= u64::from(slabs) * u64::from(atlas.slab_bricks());
-        let s = &self.sections[section];
-        if !fits
-            || s.chunk_bytes as usize != atlas.slab_bytes()
-            || s.raw_bytes != atlas.bytes()
-            || s.chunks != slabs
-        {
-            return corrupt(format!("the {} atlas does not fit its texels", codec.name()));
-        }
-        Ok((atlas, section))
+        let read_now = || self.sections.iter().filter(|s| kind::READ_BY_OPEN.contains(&s.kind));
+        let sum = |bytes: fn(&Section) -> u64| read_now().map(bytes).fold(0, u64::saturating_add);
+        let raw_bytes = sum(|section| section.raw_bytes);
+        ensure(fits_memory(raw_bytes, sum(|section| section.stored_bytes)), || {
+            format!("the tables and the tree claim to unpack to {raw_bytes} bytes")
+        })
     }
 
+    /// Reads the atlases and finds the texels of each: rules 18 to 21.
+    fn read_atlases(&mut self) -> Result<(), PackError> {
+        for record in self.records::<AtlasRecord>(kind::ATLASES)? {
+            let AtlasRecord { codec: tag, bricks, columns, rows, slabs, page_slabs } = record;
+            let Some(codec) = Codec::from_tag(tag).filter(|c| *c != Codec::Constant) else {
+                return corrupt(format!("an atlas has the unknown codec {tag}"));
+            };
+            let name = codec.name();
+            ensure(self.atlas(codec).is_none(), || format!("two atlases are {name}"))?;
+            let atlas = Atlas { codec, bricks, columns, rows, slabs, page_slabs };
+            let page_slices = u64::from(page_slabs) * codec.layout().slices as u64;
+            let is_slab = (1..=256).contains(&columns) && (1..=256).contains(&rows);
+            ensure(is_slab && (1..=MAX_TEXELS.into()).contains(&page_slices), || {
+                format!("the {name} atlas has impossible slabs or pages")
+            })?;
+            ensure(u64::from(bricks) <= u64::from(slabs) * u64::from(atlas.slab_bricks()), || {
+                format!("the {name} atlas has more bricks than its slabs")
+            })?;
+            let of_codec = |section: &Section| section.kind == kind::TEXELS && section.codec == tag;
+            let mut sections = self.sections.iter().enumerate().filter(|(_, s)| of_codec(s));
+            let (Some((place, section)), None) = (sections.next(), sections.next()) else {
+                return corrupt(format!("the {name} atlas has not one texels section"));
+            };
+            ensure(
+                section.chunk_bytes as usize == atlas.slab_bytes() && section.raw_bytes == atlas.bytes(),
+                || format!("the {name} atlas does not fit its texels"),
+            )?;
+            self.atlases.push(atlas);
+            self.texel_sections.push(place);
+        }
+        let texels = self.sections.iter().filter(|s| s.kind == kind::TEXELS).count();
+        ensure(texels == self.atlases.len(), || "there are texels without an atlas".to_owned())
+    }
+
+    /// Reads grids and frames: rules 24 and 32 to 40.
     fn read_grids(&self) -> Result<Vec<Grid>, PackError> {
         let records: Vec<GridRecord> = self.records(kind::GRIDS)?;
         let frames: Vec<FrameRecord> = self.records(kind::FRAMES)?;
         let lists: Vec<u32> = self.records(kind::FRAME_CHUNKS)?;
         let names: Vec<u8> = self.records(kind::NAMES)?;
-        if records.len() != self.tree[super::tree::header::GRIDS] as usize {
-            return corrupt("the grid table and the tree disagree about the number of grids");
+        ensure(!records.is_empty() && records.len() == self.tree[header::GRIDS] as usize, || {
+            "the grid table and the tree disagree about the number of grids, or there is none".to_owned()
+        })?;
+        let names_of = records.iter().map(|r| check::range(r.name_offset, r.name_bytes));
+        let frames_of = records.iter().map(|r| check::range(r.first_frame, r.frames));
+        let lists_of = frames.iter().map(|f| check::range(f.first_chunk, f.chunks));
+        check::parts(names_of.clone(), names.len(), "the grids' names")?;
+        check::parts(frames_of.clone(), frames.len(), "the grids' frames")?;
+        check::parts(lists_of, lists.len(), "the frames' chunk lists")?;
+        check::frame_order(&records, &frames)?;
+
+        let mut grids = Vec::with_capacity(records.len());
+        for ((record, name), own) in records.iter().zip(names_of).zip(frames_of) {
+            let g = grids.len();
+            let Ok(name) = std::str::from_utf8(&names[name]) else {
+                return corrupt(format!("the name of grid {g} is not UTF-8"));
+            };
+            let mut grid = check::grid(&self.tree, g, *record, name)?;
+            grid.frames.extend(frames[own].iter().map(|record| Frame {
+                chunks: lists[check::range(record.first_chunk, record.chunks)].to_vec(),
+                record: *record,
+            }));
+            grids.push(grid);
         }
-        // Names and lists lie end to end. Were the same bytes to serve many, a small file could take all
-        // memory.
-        let name_bytes: u64 = records.iter().map(|r| u64::from(r.name_bytes)).sum();
-        let list_words: u64 = frames.iter().map(|f| u64::from(f.chunks)).sum();
-        if name_bytes > names.len() as u64 || list_words > lists.len() as u64 {
-            return corrupt("the grids' names or the frames' chunk lists overlap");
-        }
-        let mut out = Vec::with_capacity(records.len());
-        for (g, record) in records.iter().enumerate() {
-            let name = slice(&names, record.name_offset, record.name_bytes)
-                .and_then(|name| std::str::from_utf8(name).ok())
-                .ok_or_else(|| PackError::Corrupt(format!("grid {g} has no valid name")))?;
-            let entries = slice(&frames, record.first_frame, record.frames).ok_or_else(|| {
-                PackError::Corrupt(format!("grid {name:?} has frames outside the frame table"))
-            })?;
-            let mut grid = super::check::grid_header(&self.tree, g, *record, name)?;
-            for frame in entries {
-                let chunks = slice(&lists, frame.first_chunk, frame.chunks).ok_or_else(|| {
-                    PackError::Corrupt(format!("grid {name:?} frame {} has no chunk list", frame.number))
-                })?;
-                if frame.grid as usize != g || frame.source as usize >= self.provenance.sources.len() {
-                    return corrupt(format!("grid {name:?} frame {} is not its own", frame.number));
-                }
-                grid.frames.push(Frame { record: *frame, chunks: chunks.to_vec() });
-            }
-            out.push(grid);
-        }
-        Ok(out)
+        let roots = grids.iter().map(Grid::root_words);
+        check::parts(roots, self.tree.len(), "the frames' roots")?;
+        Ok(grids)
     }
 
-    /// The only section of a kind.
+    /// The only section of a kind: rule 13.
     fn section(&self, kind: u32) -> Result<&Section, PackError> {
         let mut of_kind = self.sections.iter().filter(|s| s.kind == kind);
         match (of_kind.next(), of_kind.next()) {
@@ -257,16 +283,10 @@ impl Pack {
     /// The entries of a section; bytes behind the last whole one are an error.
     fn records<T: Pod>(&self, kind: u32) -> Result<Vec<T>, PackError> {
         let section = self.section(kind)?;
-        if section.raw_bytes > SMALL_SECTION && section.raw_bytes / MAX_EXPANSION > section.stored_bytes {
-            return corrupt(format!(
-                "the {} claims to unpack to {} bytes",
-                kind::name(kind),
-                section.raw_bytes
-            ));
-        }
-        if !section.raw_bytes.is_multiple_of(size_of::<T>() as u64) {
-            return corrupt(format!("the {} is not a whole number of entries", kind::name(kind)));
-        }
+        // Rule 17.
+        ensure(section.raw_bytes.is_multiple_of(size_of::<T>() as u64), || {
+            format!("the {} is not a whole number of entries", kind::name(kind))
+        })?;
         let mut records: Vec<T> = zeroed_vec(section.raw_bytes as usize / size_of::<T>());
         let mut rest: &mut [u8] = bytemuck::cast_slice_mut(&mut records);
         for chunk in chunk_range(section) {
@@ -285,6 +305,7 @@ impl Pack {
         let stored = &self.bytes[chunk.offset as usize..][..chunk.stored_bytes as usize];
         if !self.checked[index].load(Ordering::Relaxed) {
             if *blake3::hash(stored).as_bytes() != chunk.digest {
+                // Rule 15.
                 return Err(PackError::Digest {
                     what: format!("chunk {index} ({})", kind::name(section.kind)),
                 });
@@ -294,6 +315,11 @@ impl Pack {
         if section.encoding == encoding::RAW || chunk.stored_bytes == chunk.raw_bytes {
             return Ok(Cow::Borrowed(stored));
         }
+        // Rule 16. zstd's own decoder takes several frames too, which other readers do not.
+        let frame = zstd::zstd_safe::find_frame_compressed_size(stored);
+        ensure(frame.is_ok_and(|bytes| bytes == stored.len()), || {
+            format!("chunk {index} does not unpack: it is not one zstd frame")
+        })?;
         let raw_bytes = chunk.raw_bytes as usize;
         let raw = zstd::bulk::decompress(stored, raw_bytes)
             .map_err(|e| PackError::Corrupt(format!("chunk {index} does not unpack: {e}")))?;
@@ -318,6 +344,18 @@ impl Pack {
         self.chunk(section, chunk)
     }
 
+    /// The texels section that a chunk belongs to.
+    pub(super) fn texels_of(&self, chunk: u32) -> Option<&Section> {
+        let sections = self.texel_sections.iter().map(|&place| &self.sections[place]);
+        sections.into_iter().find(|section| chunk_range(section).contains(&(chunk as usize)))
+    }
+
+    /// Bytes of a chunk: decoded, and in the file.
+    pub(super) fn chunk_bytes(&self, chunk: u32) -> (u64, u64) {
+        let chunk = &self.chunks[chunk as usize];
+        (chunk.raw_bytes.into(), chunk.stored_bytes.into())
+    }
+
     /// The texel section of a codec and the place of a slab's chunk.
     pub(super) fn slab_chunk(&self, codec: Codec, slab: u32) -> Option<(&Section, usize)> {
         let place = self.atlases.iter().position(|a| a.codec == codec)?;
@@ -337,7 +375,7 @@ impl Pack {
     pub fn check_chunks(&self) -> Result<(), PackError> {
         use rayon::prelude::*;
         // Sections of a kind that this reader does not know may be stored in a way that it does not know.
-        let known = self.sections.par_iter().filter(|s| s.kind <= kind::PROVENANCE);
+        let known = self.sections.par_iter().filter(|s| kind::is_known(s.kind));
         known.try_for_each(|section| {
             chunk_range(section).into_par_iter().try_for_each(|index| self.chunk(section, index).map(drop))
         })
@@ -352,16 +390,6 @@ impl Pack {
     pub fn stored_texel_bytes(&self) -> u64 {
         self.sections.iter().filter(|s| s.kind == kind::TEXELS).map(|s| s.stored_bytes).sum()
     }
-
-    /// How many chunks there are, texels and all.
-    pub(super) fn chunk_count(&self) -> usize {
-        self.chunks.len()
-    }
-}
-
-fn slice<T>(all: &[T], first: u32, count: u32) -> Option<&[T]> {
-    let first = first as usize;
-    all.get(first..first.checked_add(count as usize)?)
 }
 
 fn unshuffle(bytes: &[u8], width: usize) -> Vec<u8> {

@@ -1,4 +1,6 @@
 //! The header and the tables of a pack, checked against the file and each other.
+//!
+//! Numbers of rules are those of `docs/format.md`, "What a reader checks".
 
 use std::ops::Range;
 
@@ -6,12 +8,22 @@ use bytemuck::Zeroable;
 use bytemuck::allocation::pod_collect_to_vec;
 
 use super::PackError;
-use super::error::corrupt;
-use super::layout::{Chunk, Header, MAGIC, Section, VERSION, encoding, kind};
+use super::error::{corrupt, ensure};
+use super::layout::{ALIGNMENT, Chunk, Header, MAGIC, Section, VERSION, encoding, kind};
 use super::writer::tables_digest;
 
-/// A chunk is about 256 KiB; one larger than this is damage.
+/// Rule 10: what one chunk may take in memory. Those that volpack writes have at most 256 KiB.
 const MAX_CHUNK: u32 = 16 << 20;
+
+/// Rule 14: what is decoded as a whole takes at most this much memory ...
+const MAX_WHOLE: u64 = 256 << 20;
+/// ... or this many times its bytes in the file. Trees shrink 2 to 10 times.
+const MAX_EXPANSION: u64 = 512;
+
+/// Rule 14: keeps a small file from taking all memory.
+pub(super) fn fits_memory(raw_bytes: u64, stored_bytes: u64) -> bool {
+    raw_bytes <= MAX_WHOLE.max(stored_bytes.saturating_mul(MAX_EXPANSION))
+}
 
 /// A section's chunks, by their places in the table.
 pub(super) fn chunk_range(section: &Section) -> Range<usize> {
@@ -21,81 +33,90 @@ pub(super) fn chunk_range(section: &Section) -> Range<usize> {
 /// Reads header, sections and chunks and checks that they agree with the file and each other.
 pub(super) fn read_tables(bytes: &[u8]) -> Result<(Vec<Section>, Vec<Chunk>), PackError> {
     if !bytes.starts_with(&MAGIC) {
-        return Err(PackError::NotPack);
+        return Err(PackError::NotPack); // Rule 1.
     }
     let mut header = Header::zeroed();
     let header_bytes = bytes.get(..size_of::<Header>());
     let cut = || PackError::Corrupt("the file ends inside its tables".to_owned());
     bytemuck::bytes_of_mut(&mut header).copy_from_slice(header_bytes.ok_or_else(cut)?);
     if header.major != VERSION {
-        return Err(PackError::Version(header.major));
+        return Err(PackError::Version(header.major)); // Rule 2.
     }
     let have = bytes.len() as u64;
     if header.file_bytes != have {
-        return Err(PackError::Length { have, says: header.file_bytes });
+        return Err(PackError::Length { have, says: header.file_bytes }); // Rule 3.
     }
     let sections_end = size_of::<Header>() + header.sections as usize * size_of::<Section>();
     let tables_end = sections_end as u64 + u64::from(header.chunks) * size_of::<Chunk>() as u64;
     if tables_end > have {
-        return Err(cut());
+        return Err(cut()); // Rule 4.
     }
-    let tables_end = tables_end as usize;
     let sections: Vec<Section> = pod_collect_to_vec(&bytes[size_of::<Header>()..sections_end]);
-    let chunks: Vec<Chunk> = pod_collect_to_vec(&bytes[sections_end..tables_end]);
+    let chunks: Vec<Chunk> = pod_collect_to_vec(&bytes[sections_end..tables_end as usize]);
     if tables_digest(&header, &sections, &chunks) != header.digest {
-        return Err(PackError::Digest { what: "the header".to_owned() });
+        return Err(PackError::Digest { what: "the header".to_owned() }); // Rule 5.
     }
-
-    let mut at = tables_end as u64;
-    let mut next_chunk = 0u64;
+    let (mut next_chunk, mut at) = (0, tables_end);
     for section in &sections {
-        let name = kind::name(section.kind);
-        let first = u64::from(section.first_chunk);
-        if first != next_chunk || first + u64::from(section.chunks) > chunks.len() as u64 {
-            return corrupt(format!("the {name} has chunks outside the chunk table"));
-        }
-        next_chunk += u64::from(section.chunks);
-        if section.offset < at || section.chunk_bytes == 0 || section.chunk_bytes > MAX_CHUNK {
-            return corrupt(format!("the {name} overlaps what is before it"));
-        }
-        // Also keeps every sum of an offset and a length below from wrapping.
-        if section.offset > have {
-            return corrupt(format!("the {name} begins behind the end of the file"));
-        }
-        let entries = &chunks[chunk_range(section)];
-        if *blake3::hash(bytemuck::cast_slice(entries)).as_bytes() != section.digest {
-            return Err(PackError::Digest { what: format!("the {name}'s chunk table") });
-        }
-        if section.encoding > encoding::ZSTD_SHUFFLE_4 && section.kind <= kind::PROVENANCE {
-            return corrupt(format!("the {name} has the unknown encoding {}", section.encoding));
-        }
-        // Chunks lie one behind another, so no bytes serve twice.
-        at = section.offset;
-        let mut raw = 0u64;
-        for (i, chunk) in entries.iter().enumerate() {
-            let last = i + 1 == entries.len();
-            let size_fits = if last {
-                (1..=section.chunk_bytes).contains(&chunk.raw_bytes)
-            } else {
-                chunk.raw_bytes == section.chunk_bytes
-            };
-            let stored_fits = if section.encoding == encoding::RAW {
-                chunk.stored_bytes == chunk.raw_bytes
-            } else {
-                chunk.stored_bytes <= chunk.raw_bytes
-            };
-            if chunk.offset != at || !size_fits || !stored_fits {
-                return corrupt(format!("chunk {i} of the {name} does not lie where it should"));
-            }
-            at += u64::from(chunk.stored_bytes);
-            raw += u64::from(chunk.raw_bytes);
-            if at > have {
-                return corrupt(format!("chunk {i} of the {name} ends behind the file"));
-            }
-        }
-        if raw != section.raw_bytes || at - section.offset != section.stored_bytes {
-            return corrupt(format!("the {name} is not as long as its chunks"));
-        }
+        at = check_section(section, &chunks, next_chunk, at, have)?;
+        next_chunk += section.chunks as usize;
+    }
+    if next_chunk != chunks.len() {
+        return corrupt("the chunk table has chunks of no section"); // Rule 6.
     }
     Ok((sections, chunks))
+}
+
+/// Checks the next section, whose first chunk is `next_chunk` and which begins at byte `at` or later. Returns where it
+/// ends in a file of `have` bytes.
+fn check_section(
+    section: &Section,
+    chunks: &[Chunk],
+    next_chunk: usize,
+    at: u64,
+    have: u64,
+) -> Result<u64, PackError> {
+    let name = kind::name(section.kind);
+    // Rule 6.
+    let entries = chunks.get(chunk_range(section)).filter(|_| section.first_chunk as usize == next_chunk);
+    let Some(entries) = entries else {
+        return corrupt(format!("the {name} has chunks outside the chunk table"));
+    };
+    // Rule 7. That it begins inside also keeps every sum of an offset and a length below from wrapping.
+    ensure(section.offset.is_multiple_of(ALIGNMENT), || {
+        format!("the {name} does not begin at a multiple of {ALIGNMENT}")
+    })?;
+    ensure(section.offset >= at, || format!("the {name} overlaps what is before it"))?;
+    ensure(section.offset <= have, || format!("the {name} begins behind the end of the file"))?;
+    if *blake3::hash(bytemuck::cast_slice(entries)).as_bytes() != section.digest {
+        return Err(PackError::Digest { what: format!("the {name}'s chunk table") }); // Rule 8.
+    }
+    // Rule 9.
+    ensure(section.encoding <= encoding::ZSTD_SHUFFLE_4 || !kind::is_known(section.kind), || {
+        format!("the {name} has the unknown encoding {}", section.encoding)
+    })?;
+    // Rule 10.
+    ensure((1..=MAX_CHUNK).contains(&section.chunk_bytes), || {
+        format!("the {name} has chunks of {} bytes, not of 1 to {MAX_CHUNK}", section.chunk_bytes)
+    })?;
+    let (mut end, mut raw) = (section.offset, 0);
+    for (i, chunk) in entries.iter().enumerate() {
+        let least = if i + 1 == entries.len() { 1 } else { section.chunk_bytes };
+        ensure((least..=section.chunk_bytes).contains(&chunk.raw_bytes), || {
+            format!("chunk {i} of the {name} decodes to {} bytes", chunk.raw_bytes) // Rule 10.
+        })?;
+        // Rule 11. Chunks lie one behind another, so no bytes serve twice.
+        let least = if section.encoding == encoding::RAW { chunk.raw_bytes } else { 0 };
+        ensure(chunk.offset == end && (least..=chunk.raw_bytes).contains(&chunk.stored_bytes), || {
+            format!("chunk {i} of the {name} does not lie where it should")
+        })?;
+        end += u64::from(chunk.stored_bytes);
+        raw += u64::from(chunk.raw_bytes);
+        ensure(end <= have, || format!("chunk {i} of the {name} ends behind the file"))?;
+    }
+    // Rule 12.
+    ensure(raw == section.raw_bytes && end - section.offset == section.stored_bytes, || {
+        format!("the {name} is not as long as its chunks")
+    })?;
+    Ok(end)
 }

@@ -84,7 +84,10 @@ const LISTED: usize = 5;
 /// What differs between the output, if it is there, and what would be made.
 fn reasons(job: &Job, new: &Provenance) -> Vec<String> {
     let old = match Pack::open(&job.output) {
-        Ok(pack) => pack.provenance,
+        Ok(pack) => match pack.provenance() {
+            Ok(provenance) => provenance,
+            Err(e) => return vec![format!("{}: {e}", job.output.display())],
+        },
         Err(_) if !job.output.exists() => return vec![format!("there is no {}", job.output.display())],
         Err(e) => return vec![format!("{} cannot be used: {e}", job.output.display())],
     };

@@ -42,7 +42,7 @@ pub(super) fn compared_at_once(pack: &Pack, sources: &[PathBuf], resources: &Res
     let Some(limit) = resources.memory else { return Ok(most) };
     let files: Vec<&Path> = sources.iter().map(|path| &**path).collect();
     let grids: Vec<&str> = pack.grids.iter().map(|grid| &*grid.name).collect();
-    let integers = pack.provenance.settings.integers;
+    let integers = pack.provenance().map_err(Error::provenance(pack))?.settings.integers;
     Ok(at_once(limit, size_of_val(&*pack.tree) as u64, &files, &sizes(&files, &grids, integers)?)?.min(most))
 }
 

@@ -218,7 +218,7 @@ fn build_cached(
             (pack, report, false)
         }
     };
-    if reuse.is_some() && !plan.provenance.is(&pack.provenance) {
+    if reuse.is_some() && !pack.provenance().is_ok_and(|found| plan.provenance.is(&found)) {
         return Err(Error::Misled("the pack under its key is another one".to_owned()));
     }
     clock.lap("verify");

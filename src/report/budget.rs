@@ -5,7 +5,7 @@ use serde::Serialize;
 
 use super::model::{BuildReport, Figures, Total};
 use crate::pack::Pack;
-use crate::settings::{Budget, ErrorBound, Format, Masks, Quality};
+use crate::settings::{Budget, ErrorBound, Format, Masks, Quality, Settings};
 use crate::units::{bytes, seconds};
 use crate::vdb::voxel_size;
 use crate::verify::VerifyReport;
@@ -49,6 +49,8 @@ pub struct Checked<'a> {
     pub baseline: Option<&'a Figures>,
     /// The pack.
     pub pack: &'a Pack,
+    /// What it was built with.
+    pub settings: &'a Settings,
     /// What was found of it.
     pub found: Option<&'a VerifyReport>,
     /// How it came to be.
@@ -97,7 +99,7 @@ impl Checked<'_> {
             budget.tree_share.map(|share| share.0).filter(|limit| figures.tree_share > *limit)
         {
             let message = format!("{:.1} % are over {:.1} %", figures.tree_share * 100.0, limit * 100.0);
-            let remedy = match self.pack.provenance.settings.masks {
+            let remedy = match self.settings.masks {
                 Masks::Keep => "masks = \"auto\" drops those that nothing needs",
                 _ => {
                     "the tree is the volume's shape: a larger tree_share, or more texels to it by a finer psnr"
@@ -261,7 +263,7 @@ impl Checked<'_> {
 
     /// A setting of adaptive packs, and what it does not go with.
     fn adaptive(&self, setting: &str, would: &str) -> String {
-        let settings = &self.pack.provenance.settings;
+        let settings = self.settings;
         let asked = key(settings.quality).filter(|asked| !setting.starts_with(asked));
         let format = if settings.format == Format::Adaptive { "" } else { "format = \"adaptive\" with " };
         let mut remedy = format!("{format}{setting} {would} meet it");

@@ -23,7 +23,7 @@ pub use markdown::markdown;
 pub use pack::{CodecSummary, PackSummary};
 pub use vdb::{GridSummary, ValueSummary, VdbSummary};
 
-use crate::pack::Pack;
+use crate::pack::{Pack, Provenance};
 use crate::settings::Budget;
 use crate::verify::VerifyReport;
 use model::{AssetReport, BuildReport, Cheaper, Figures, PackReport, Report, Reproduce, Total};
@@ -39,6 +39,8 @@ pub struct Reported<'a> {
     pub name: &'a str,
     /// The pack.
     pub pack: &'a Pack,
+    /// Where it comes from.
+    pub provenance: &'a Provenance,
     /// Its file.
     pub file: &'a Path,
     /// BLAKE3 of the file.
@@ -62,8 +64,9 @@ pub struct Reported<'a> {
 impl Reported<'_> {
     /// The figures, and every limit that is past.
     pub fn report(self) -> (PackReport, Vec<Breach>) {
-        let pack = self.pack;
-        let figures = Figures::new(pack, &self.summary, self.found.as_ref(), self.build.as_ref());
+        let (pack, provenance) = (self.pack, self.provenance);
+        let figures =
+            Figures::new(&provenance.sources, &self.summary, self.found.as_ref(), self.build.as_ref());
         let baseline = self.baseline.and_then(|baseline| baseline.figures(self.name));
         let breaches = budget::Checked {
             name: self.name,
@@ -71,12 +74,13 @@ impl Reported<'_> {
             figures: &figures,
             baseline,
             pack,
+            settings: &provenance.settings,
             found: self.found.as_ref(),
             build: self.build.as_ref(),
         }
         .breaches();
-        let mut settings = serde_json::to_value(&pack.provenance.settings).unwrap_or_default();
-        settings["quality"] = pack.provenance.settings.quality.to_string().into();
+        let mut settings = serde_json::to_value(&provenance.settings).unwrap_or_default();
+        settings["quality"] = provenance.settings.quality.to_string().into();
         let report = PackReport {
             file: self.file.display().to_string(),
             change: baseline.map(|old| figures.change_from(old)),
@@ -88,11 +92,11 @@ impl Reported<'_> {
             cheaper: self.cheaper,
             reproduce: Reproduce {
                 command: self.command,
-                tool: format!("{} {}", pack.provenance.tool, pack.provenance.version),
-                encoder_isa: pack.provenance.encoder_isa.clone(),
+                tool: format!("{} {}", provenance.tool, provenance.version),
+                encoder_isa: provenance.encoder_isa.clone(),
                 settings,
                 blake3: self.digest.to_hex().to_string(),
-                sources: pack.provenance.sources.iter().map(Into::into).collect(),
+                sources: provenance.sources.iter().map(Into::into).collect(),
             },
         };
         (report, breaches)

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use super::PackSummary;
 use super::budget::Breach;
 use crate::cache::Uses;
-use crate::pack::{Pack, Source};
+use crate::pack::Source;
 use crate::settings::Budget;
 use crate::verify::VerifyReport;
 
@@ -269,9 +269,9 @@ impl Figures {
         }
     }
 
-    /// Sums up a pack and what was found of it.
+    /// Sums up a pack, its sources and what was found of it.
     pub fn new(
-        pack: &Pack,
+        sources: &[Source],
         summary: &PackSummary,
         found: Option<&VerifyReport>,
         build: Option<&BuildReport>,
@@ -283,11 +283,7 @@ impl Figures {
         Self {
             gpu_bytes: summary.gpu_bytes,
             file_bytes: summary.file_bytes,
-            source_bytes: pack
-                .provenance
-                .sources
-                .iter()
-                .fold(0, |sum, source| sum.saturating_add(source.bytes)),
+            source_bytes: sources.iter().fold(0, |sum, source| sum.saturating_add(source.bytes)),
             tree_share: tree as f64 / summary.gpu_bytes.max(1) as f64,
             bits_per_voxel: summary.bits_per_voxel,
             compared: found.is_some(),

@@ -18,6 +18,7 @@ pub enum Dedup {
 
 /// How `dedup = "kmeans"` clusters (Utrecht thesis, 4.5 and 5.3).
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
 pub struct Clustering {
     /// How many clusters there are at most: the thesis's k.
     pub clusters: u32,

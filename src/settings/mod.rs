@@ -115,6 +115,7 @@ pub const DEFAULT_ZSTD: i32 = 3;
 
 /// Everything that a pack's bytes depend on beside its sources.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
 pub struct Settings {
     /// The grids to pack; none for the default one.
     pub grids: Vec<String>,

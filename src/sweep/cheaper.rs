@@ -35,7 +35,8 @@ pub fn cheaper(
     job.pictures.images = None;
     let outcome = build(&job, progress)?;
     let pack = Pack::open(&job.output).map_err(Error::pack(&job.output))?;
-    let figures = Figures::new(&pack, &outcome.summary, outcome.verification.as_ref(), None);
+    let provenance = pack.provenance().map_err(Error::provenance(&pack))?;
+    let figures = Figures::new(&provenance.sources, &outcome.summary, outcome.verification.as_ref(), None);
     // One that fails verification is no offer.
     Ok((figures.ok && figures.gpu_bytes < most).then_some(Cheaper { setting, figures }))
 }

@@ -141,11 +141,12 @@ fn run(options: &Options, method: &Method, variation: Variation, folder: &Path) 
 
     let pack = Pack::open(&job.output).map_err(Error::pack(&job.output))?;
     let bytes = std::fs::read(&job.output).map_err(Error::io(&job.output))?;
+    let provenance = pack.provenance().map_err(Error::provenance(&pack))?;
     let grid = &pack.grids[0];
     let (mut difference, mut range) = (Difference::default(), None);
     let mut jumps = [Jumps::default(); 2];
     for (f, frame) in grid.frames.iter().enumerate() {
-        let name = &pack.provenance.sources[frame.record.source as usize].file;
+        let name = &provenance.source(&frame.record).map_err(Error::provenance(&pack))?.file;
         let path = frames.iter().find(|p| p.file_name().is_some_and(|n| n == name.as_str()));
         let path = path.ok_or_else(|| Error::Other(format!("{name} is not among the files")))?;
         let Some(Flattened { frame: mut flat, .. }) = flat_frame(path, &grid.name, options)? else {

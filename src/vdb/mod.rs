@@ -26,7 +26,7 @@ pub use file::VdbFile;
 pub use grid::{GridClass, GridInfo};
 pub use stats::{TopologyStats, ValueStats};
 pub use transform::{Transform, voxel_size};
-pub use tree::{Accessor, Internal, LEAVES_IN_BLOCK, Leaves, RootTile, Tree, TreeSize};
+pub use tree::{Accessor, Internal, LEAVES_IN_BLOCK, Leaves, RootTile, TileAt, Tree, TreeSize};
 pub use value::{Scalar, Value, ValueType, with_scalar_type, with_value_type};
 
 /// `Result` with a [`VdbError`].

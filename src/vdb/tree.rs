@@ -134,6 +134,28 @@ pub struct Accessor<'a, T> {
     roots: HashMap<Coord, Root>,
 }
 
+/// A tile that a voxel is in.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TileAt<T> {
+    /// The value of every voxel inside.
+    pub value: T,
+    /// Whether they are active.
+    pub active: bool,
+    /// Voxels along an axis.
+    pub dim: i32,
+}
+
+enum Found<T> {
+    Tile(TileAt<T>),
+    Leaf(usize),
+}
+
+impl<T> Found<T> {
+    fn tile(value: T, active: bool, dim: i32) -> Self {
+        Self::Tile(TileAt { value, active, dim })
+    }
+}
+
 enum Root {
     Tile(usize),
     Node(usize),
@@ -149,23 +171,39 @@ impl<'a, T: Copy> Accessor<'a, T> {
 
     /// The value and active state of the voxel at `at`.
     pub fn get(&self, at: Coord) -> (T, bool) {
+        match self.find(at) {
+            Found::Tile(tile) => (tile.value, tile.active),
+            Found::Leaf(leaf) => {
+                let voxel = at.child_index(3, 1);
+                (self.tree.leaves.values(leaf)[voxel], self.tree.leaves.masks[leaf].get(voxel))
+            }
+        }
+    }
+
+    /// The tile around `at`, which outside of everything is background; `None` in a leaf.
+    pub fn tile(&self, at: Coord) -> Option<TileAt<T>> {
+        match self.find(at) {
+            Found::Tile(tile) => Some(tile),
+            Found::Leaf(_) => None,
+        }
+    }
+
+    fn find(&self, at: Coord) -> Found<T> {
         let tree = self.tree;
         let l1 = match self.roots.get(&at.align_down(ROOT_DIM)) {
-            None => return (tree.background, false),
-            Some(&Root::Tile(i)) => return (tree.tiles[i].value, tree.tiles[i].active),
+            None => return Found::tile(tree.background, false, ROOT_DIM),
+            Some(&Root::Tile(i)) => return Found::tile(tree.tiles[i].value, tree.tiles[i].active, ROOT_DIM),
             Some(&Root::Node(i)) => &tree.l1[i],
         };
         let index = at.child_index(5, CELL_DIM);
         if !l1.is_child(index) {
-            return (l1.tiles[index], l1.is_active(index));
+            return Found::tile(l1.tiles[index], l1.is_active(index), CELL_DIM);
         }
         let l2 = &tree.l2[l1.first_child + l1.rank(index)];
         let index = at.child_index(4, BRICK_DIM);
         if !l2.is_child(index) {
-            return (l2.tiles[index], l2.is_active(index));
+            return Found::tile(l2.tiles[index], l2.is_active(index), BRICK_DIM);
         }
-        let leaf = l2.first_child + l2.rank(index);
-        let voxel = at.child_index(3, 1);
-        (tree.leaves.values(leaf)[voxel], tree.leaves.masks[leaf].get(voxel))
+        Found::Leaf(l2.first_child + l2.rank(index))
     }
 }

@@ -7,7 +7,7 @@ use crate::codec::{BrickRange, Codec};
 use crate::pack::{FrameReader, Region};
 use crate::settings::{Format, Masks, NonFinite};
 use crate::stages::component::Component;
-use crate::vdb::{GridInfo, Internal, Scalar, Tree};
+use crate::vdb::{Accessor, GridInfo, Internal, Scalar, Tree};
 use crate::volume::{
     BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, InactiveRule, Mask512, ROOT_DIM, ValueRange,
 };
@@ -177,7 +177,7 @@ impl<T: Scalar> Comparison<'_, T> {
         }
     }
 
-    /// Every tile of the source, active or not, must be there exactly.
+    /// Every tile of the source but inactive background must be there exactly.
     fn check_tiles(&self, error: &mut FrameError) {
         for tile in &self.tree.tiles {
             self.check_tile(tile.origin, ROOT_DIM, tile.value, tile.active, error);
@@ -198,13 +198,12 @@ impl<T: Scalar> Comparison<'_, T> {
         let value = self.value(value);
         if active {
             error.active_value(value);
+        } else if value == self.reader.grid().background {
+            return;
         }
         let (region, region_dim) = self.reader.locate(origin);
         let same = match region {
-            Region::Background => {
-                let background = self.reader.grid().background;
-                region_dim >= dim && !active && value == background
-            }
+            Region::Background => false,
             Region::Constant(constant) => {
                 region_dim >= dim && (constant.value, constant.active) == (value, active)
             }
@@ -221,14 +220,18 @@ impl<T: Scalar> Comparison<'_, T> {
         }
     }
 
-    /// Nothing may be where the source has no root entry; inside one, every leaf and tile is asked for.
+    /// Nothing may be where the source has inactive background, nor reach further than a tile of it; all else of the source
+    /// is asked for.
     fn check_outside(&self, error: &mut FrameError) {
-        let mut entries: Vec<Coord> = self.tree.l1.iter().map(|n| n.origin).collect();
-        entries.extend(self.tree.tiles.iter().map(|t| t.origin));
-        entries.sort_unstable();
-        self.reader.for_each_region(|origin, _, _| {
+        let source = Accessor::new(self.tree);
+        let background = self.reader.grid().background;
+        self.reader.for_each_region(|origin, dim, _| {
             error.has_regions = true;
-            if entries.binary_search(&origin.align_down(ROOT_DIM)).is_err() {
+            let fits = match source.tile(origin) {
+                Some(tile) => tile.dim >= dim && (tile.active || self.value(tile.value) != background),
+                None => dim == BRICK_DIM,
+            };
+            if !fits {
                 error.fail(|| format!("the pack has voxels at {:?}, where the source has none", origin.0));
             }
         });

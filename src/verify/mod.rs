@@ -24,6 +24,7 @@ pub use pictures::{
 
 use crate::error::{Error, Result};
 use crate::pack::{Frame, Grid, Pack, Provenance};
+use crate::settings::Settings;
 use crate::stages::component::find_packed;
 use crate::stages::metadata::digest;
 use crate::vdb::{GridClass, VdbFile, with_scalar_type};
@@ -32,20 +33,28 @@ use promise::Promise;
 pub use promise::{KEPT_INTEGER_ERROR, SIGN_MATTERS_VOXELS};
 
 /// The files that a pack was made from, told by their digests.
-pub struct Sources(Vec<PathBuf>);
+pub struct Sources {
+    files: Vec<PathBuf>,
+    /// What the pack was built from and with, which says what has to hold.
+    provenance: Provenance,
+}
 
 impl Sources {
     /// Finds the pack's sources among some files.
     ///
     /// # Errors
-    /// When one is missing, changed or unreadable.
+    /// When one is missing, changed or unreadable, or the pack's provenance cannot be used.
     pub fn find(pack: &Pack, files: &[PathBuf]) -> Result<Self> {
-        match_sources(pack, files).map(Self)
+        let provenance = pack.provenance().map_err(Error::provenance(pack))?;
+        for frame in pack.grids.iter().flat_map(|grid| &grid.frames) {
+            provenance.source(&frame.record).map_err(Error::provenance(pack))?;
+        }
+        Ok(Self { files: match_sources(&provenance, files)?, provenance })
     }
 
     /// The file at a place of the provenance's list.
     fn path(&self, source: u32) -> &Path {
-        &self.0[source as usize]
+        &self.files[source as usize]
     }
 }
 
@@ -61,15 +70,16 @@ pub fn voxels(
     at_once: usize,
     mut advance: impl FnMut(u64),
 ) -> Result<VerifyReport> {
-    let paths = &sources.0;
+    let Sources { files: paths, provenance } = sources;
+    let settings = &provenance.settings;
     let mut found: Vec<Vec<Option<FoundFrame>>> =
         pack.grids.iter().map(|g| g.frames.iter().map(|_| None).collect()).collect();
-    let mut failures = check_tables(pack, &pack.provenance);
+    let mut failures = check_tables(pack, provenance);
     let places: Vec<usize> = (0..paths.len()).collect();
     for window in places.chunks(at_once) {
         crate::interrupt::check()?;
         let results: Vec<_> =
-            window.par_iter().map(|&source| compare_source(pack, source, &paths[source])).collect();
+            window.par_iter().map(|&source| compare_source(pack, settings, source, &paths[source])).collect();
         for result in results {
             let (frames, missing) = result?;
             failures.extend(missing);
@@ -88,7 +98,7 @@ pub fn voxels(
         let is_integer = frames.iter().any(|frame| frame.is_integer);
         errors.push((frames.into_iter().map(|frame| frame.error).collect(), is_integer));
     }
-    Ok(VerifyReport::new(pack, &pack.provenance.settings, errors, failures))
+    Ok(VerifyReport::new(pack, settings, errors, failures))
 }
 
 /// What a frame of a pack came to beside its source.
@@ -141,13 +151,13 @@ fn check_class(grid: &Grid, frames: &[FoundFrame]) -> Option<String> {
 }
 
 /// The file of each of the pack's sources.
-fn match_sources(pack: &Pack, sources: &[PathBuf]) -> Result<Vec<PathBuf>> {
+fn match_sources(provenance: &Provenance, sources: &[PathBuf]) -> Result<Vec<PathBuf>> {
     let digests: Vec<_> = sources.par_iter().map(|path| digest(path).map(|(hash, _)| hash)).collect();
     let mut by_digest = HashMap::new();
     for (path, digest) in sources.iter().zip(digests) {
         by_digest.insert(digest?.to_hex().to_string(), path);
     }
-    let found = pack.provenance.sources.iter().map(|source| {
+    let found = provenance.sources.iter().map(|source| {
         by_digest.get(&source.blake3).map(|path| (*path).clone()).ok_or_else(|| {
             let same_name = sources.iter().find(|p| p.file_name().is_some_and(|n| *n == *source.file));
             Error::Verify(match same_name {
@@ -167,9 +177,13 @@ fn match_sources(pack: &Pack, sources: &[PathBuf]) -> Result<Vec<PathBuf>> {
 }
 
 /// Compares the frames that one source file holds, and says which of them the pack lacks.
-fn compare_source(pack: &Pack, source: usize, path: &Path) -> Result<(Vec<FoundFrame>, Vec<String>)> {
+fn compare_source(
+    pack: &Pack,
+    settings: &Settings,
+    source: usize,
+    path: &Path,
+) -> Result<(Vec<FoundFrame>, Vec<String>)> {
     let file = VdbFile::open(path).map_err(Error::vdb(path))?;
-    let settings = &pack.provenance.settings;
     let (mut out, mut missing) = (Vec::new(), Vec::new());
     for (g, grid) in pack.grids.iter().enumerate() {
         let of_source = |f: &Frame| f.record.source as usize == source;

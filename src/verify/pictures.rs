@@ -274,7 +274,7 @@ fn source_field(pack: &Pack, sources: &Sources, [g, f]: [usize; 2]) -> Result<Fi
     let grid = &pack.grids[g];
     let path = sources.path(grid.frames[f].record.source);
     let file = VdbFile::open(path).map_err(Error::vdb(path))?;
-    let settings = &pack.provenance.settings;
+    let settings = &sources.provenance.settings;
     let (info, component) = find_packed(&file.grids, &grid.name, settings.integers)
         .ok_or_else(|| missing_grid(path, &grid.name))?;
     let flat = flatten(&file, path, info, component, settings.nonfinite)?;

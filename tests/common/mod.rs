@@ -42,7 +42,7 @@ pub fn animation() -> Vec<PathBuf> {
 pub fn skip(wanted: &str, why: &str) {
     let test = std::thread::current().name().unwrap_or("a test").to_owned();
     assert!(std::env::var_os(format!("VOLPACK_REQUIRE_{wanted}")).is_none(), "{test}: {why}");
-    writeln!(std::io::stderr(), "skipped: {test}: {why}").unwrap();
+    std::io::stderr().write_all(format!("skipped: {test}: {why}\n").as_bytes()).unwrap();
 }
 
 /// The device of tests that need one; they are skipped where there is none.
