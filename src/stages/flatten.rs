@@ -33,11 +33,20 @@ pub fn flatten(
         other => unreachable!("{} grids are refused when grids are selected", other.name())
     );
     let count = flat.frame.stats.nonfinite;
+    if nonfinite == NonFinite::Refuse && !flat.background.is_finite() {
+        return Err(Error::Input(format!(
+            "{}: grid {:?} has the background {}: repair the export, or take 0 for every value that is infinite or not \
+             a number (--nonfinite zero, or nonfinite = \"zero\" in the manifest)",
+            path.display(),
+            grid.name,
+            flat.background
+        )));
+    }
     if count > 0 && nonfinite == NonFinite::Refuse {
         let voxels = if count == 1 { "value that is" } else { "values that are" };
         return Err(Error::Input(format!(
             "{}: grid {:?} has {count} {voxels} infinite or not a number: \
-             repair the export, or set nonfinite = \"zero\"",
+             repair the export, or take 0 for each (--nonfinite zero, or nonfinite = \"zero\" in the manifest)",
             path.display(),
             grid.name
         )));
