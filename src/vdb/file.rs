@@ -200,7 +200,11 @@ fn read_grids(source: &Source, mut at: u64, count: u32) -> Result<Vec<GridInfo>>
         if start < behind || end < start || end > source.len() {
             return Err(VdbError::corrupt(
                 at,
-                format!("its offsets {start} to {end} lie outside the file's {} bytes", source.len()),
+                format!(
+                    "its offsets {start} to {end} lie outside the file's {} bytes: \
+                     it was cut short or is damaged: copy or export it again",
+                    source.len()
+                ),
             )
             .in_grid(&name));
         }
