@@ -315,6 +315,7 @@ fn what_init_writes_builds() {
     (1..=2).for_each(|frame| ["phi", "surface"].iter().for_each(|grid| liquid(frame, grid)));
     write_grid(&at("points"), &typed("velocity", "Tree_vec3s_5_4_3", |v| [v as f32; 3]));
     std::fs::copy(common::fixture("frustum.vdb"), at("camera")).unwrap();
+    write_grid(&at("nan_1"), &GridFile { background: f32::NAN, ..ramp("density", FLOAT) });
     write_grid(&at("cut_1"), &ramp("density", FLOAT));
     std::fs::write(at("cut_2"), "").unwrap();
 
@@ -325,6 +326,7 @@ fn what_init_writes_builds() {
         ("points", "vec3s"),
         ("camera", "NonlinearFrustumMap"),
         ("cut", "it is empty"),
+        ("nan", "the background NaN"),
         ("twice", "both frame 1"),
     ] {
         let lines: Vec<&str> = text.lines().collect();
@@ -346,7 +348,7 @@ fn what_init_writes_builds() {
     let expected = [
         ("fire", 2, ""),
         ("phi", 2, "phi"),
-        ("smoke_v1", 1, ""),
+        ("smoke_0_v1", 1, ""),
         ("smoke_v2", 3, ""),
         ("surface", 2, "surface"),
     ];

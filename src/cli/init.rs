@@ -12,7 +12,8 @@ use super::{Common, outln};
 use crate::error::{Error, Result};
 use crate::manifest::DEFAULT_NAME;
 use crate::sequence::{Numbering, Sequence, number, sequences};
-use crate::stages::select::{FrameGrids, listing, select_from};
+use crate::stages::flatten::nonfinite_background;
+use crate::stages::select::{FrameGrids, find as find_grid, listing, select_from};
 use crate::units::count;
 use crate::vdb::{GridInfo, VdbFile};
 
@@ -120,8 +121,7 @@ fn find(root: &Path, folder: &Path, depth: usize, out: &mut Vec<PathBuf>) -> Res
 fn buildable(root: &Path, sequence: &Sequence) -> Result<Buildable> {
     let files: Vec<PathBuf> = sequence.files.iter().map(|file| root.join(file)).collect();
     let Numbering { numbers, .. } = number(&files)?;
-    let open = |path: &PathBuf| Ok(VdbFile::open(path).map_err(Error::vdb(path))?.grids);
-    let grids = files.par_iter().map(open).collect::<Vec<_>>().into_iter().collect::<Result<Vec<_>>>()?;
+    let grids = in_each(&files, |file, _| Ok(file.grids))?;
     let frames: Vec<FrameGrids> = files
         .iter()
         .zip(&numbers)
@@ -130,15 +130,31 @@ fn buildable(root: &Path, sequence: &Sequence) -> Result<Buildable> {
         .collect();
     let can_be_packed = |grid: &&str| select_from(&frames, &[(*grid).to_owned()]).is_ok();
     let in_file = || frames[0].grids.iter().map(|g| &*g.name);
-    let grid = match select_from(&frames, &[]) {
-        Ok(_) => None,
+    let (grid, selection) = match select_from(&frames, &[]) {
+        Ok(selection) => (None, selection),
         Err(error) => {
-            let chosen = LIQUID_GRIDS.into_iter().chain(in_file()).find(can_be_packed);
-            Some(chosen.ok_or(error)?.to_owned())
+            let chosen = LIQUID_GRIDS.into_iter().chain(in_file()).find(can_be_packed).ok_or(error)?;
+            (Some(chosen.to_owned()), select_from(&frames, &[chosen.to_owned()])?)
         }
     };
+    in_each(&files, |file, path| {
+        for grid in selection.grids.iter().filter_map(|selected| find_grid(&file.grids, &selected.name)) {
+            let background = file.background(grid).map_err(Error::vdb(path))? as f32;
+            if !background.is_finite() {
+                return Err(nonfinite_background(path, grid, background));
+            }
+        }
+        Ok(())
+    })?;
     let packable = in_file().filter(can_be_packed).map(str::to_owned).collect();
     Ok(Buildable { packable, grid, grids: frames[0].grids.to_vec() })
+}
+
+/// What `read` makes of each file, or the error of the first that is wrong.
+fn in_each<T: Send>(files: &[PathBuf], read: impl Fn(VdbFile, &Path) -> Result<T> + Sync) -> Result<Vec<T>> {
+    let read =
+        |path: &PathBuf| VdbFile::open(path).map_err(Error::vdb(path)).and_then(|file| read(file, path));
+    files.par_iter().map(read).collect::<Vec<_>>().into_iter().collect()
 }
 
 impl Buildable {
@@ -185,13 +201,22 @@ fn frames(sequence: &Sequence) -> Vec<String> {
         .collect()
 }
 
-/// A name for an asset: that of the files without the frame number, or the folder's.
+/// A name for an asset: that of the files without the frame number, or the folder's. What is a part of one file's name may
+/// not be a frame number: digits go only from behind a separator at its end.
 fn unique(sequence: &Sequence, taken: &[String]) -> String {
     let separators = ['_', '-', '.', ' '];
-    let before = sequence.before.trim_matches(separators);
-    let after = sequence.after.rsplit_once('.').map_or("", |(after, _)| after).trim_matches(separators);
+    let without_extension = |name: &str| name.rsplit_once('.').map_or("", |(stem, _)| stem).to_owned();
+    let (before, after) = match &sequence.files[..] {
+        [only] => {
+            let stem = only.file_stem().unwrap_or_default().to_string_lossy();
+            let name = stem.trim_end_matches(|c: char| c.is_ascii_digit());
+            let is_numbered = name.is_empty() || name.ends_with(separators);
+            (if is_numbered { name } else { &stem }.to_owned(), String::new())
+        }
+        _ => (sequence.before.clone(), without_extension(&sequence.after)),
+    };
     let of_folder = sequence.folder.file_name().unwrap_or_default().to_string_lossy();
-    let name = match (before, after) {
+    let name = match (before.trim_matches(separators), after.trim_matches(separators)) {
         ("", "") => of_folder.into_owned(),
         ("", one) | (one, "") => one.to_owned(),
         (before, after) => format!("{before}_{after}"),

@@ -11,8 +11,8 @@ use super::cursor::Cursor;
 use super::grid::{Descriptor, GridInfo, read_metadata};
 use super::other_format::{HEAD, OtherFormat};
 use super::tree::{Tree, TreeSize};
-use super::tree_read::{read_leaves, read_topology, skip_leaves};
-use super::value::{Value, ValueType, with_scalar_type, with_value_type};
+use super::tree_read::{read_background, read_leaves, read_topology, skip_leaves};
+use super::value::{Scalar, Value, ValueType, with_scalar_type, with_value_type};
 use super::{Result, VdbError};
 
 /// `OPENVDB_MAGIC` as a little-endian 64-bit word.
@@ -105,6 +105,19 @@ impl VdbFile {
             T => Ok(TreeSize::of(&self.read_topology::<T>(grid)?, self.owner(grid).tree.clone())),
             other => Err(VdbError::Unsupported(format!("the voxels of {} grids are not read", other.name())))
         )
+    }
+
+    /// A grid's background, which lies before everything else in its tree. It must be of scalars.
+    ///
+    /// # Errors
+    /// As [`VdbFile::read_topology`].
+    pub fn background(&self, grid: &GridInfo) -> Result<f64> {
+        let tree = self.owner(grid).tree.clone();
+        let read = with_scalar_type!(&grid.value_type,
+            T => self.source.parse_in(tree, |c| Ok(read_background::<T>(c)?.to_f64())),
+            other => Err(VdbError::Unsupported(format!("the voxels of {} grids are not read", other.name())))
+        );
+        Ok(read.map_err(|e| self.in_grid(grid, e))?.0)
     }
 
     /// Reads a grid's masks and tiles, but not its leaves' values.
