@@ -44,6 +44,7 @@ pub mod pack;
 pub mod pipeline;
 pub mod render;
 pub mod report;
+pub mod sequence;
 pub mod settings;
 pub mod stages;
 pub mod sweep;

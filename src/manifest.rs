@@ -1,7 +1,7 @@
 //! `pipeline.toml` as types, with errors that name the line.
 
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 use serde::Deserialize;
 
@@ -231,7 +231,7 @@ pub fn expand(patterns: &[PathBuf]) -> Result<Vec<PathBuf>> {
             files.push(pattern.clone());
             continue;
         }
-        let matches = glob::glob(&text).map_err(|e| Error::Usage(format!("{text}: {e}")))?;
+        let matches = glob::glob(&glob_of(pattern)).map_err(|e| Error::Usage(format!("{text}: {e}")))?;
         let before = files.len();
         for file in matches {
             files.push(file.map_err(|e| Error::Io { path: e.path().to_owned(), source: e.into() })?);
@@ -241,6 +241,29 @@ pub fn expand(patterns: &[PathBuf]) -> Result<Vec<PathBuf>> {
         }
     }
     Ok(files)
+}
+
+/// A pattern in which folders that exist stand for themselves: one may have a bracket in its name.
+fn glob_of(pattern: &Path) -> String {
+    let mut folder = PathBuf::new();
+    let mut glob = PathBuf::new();
+    let mut components = pattern.components();
+    loop {
+        let rest = components.as_path();
+        let Some(component) = components.next() else { break };
+        folder.push(component);
+        match component {
+            Component::Normal(name) if folder.exists() => {
+                glob.push(glob::Pattern::escape(&name.to_string_lossy()));
+            }
+            Component::Normal(_) => {
+                glob.push(rest);
+                break;
+            }
+            _ => glob.push(component),
+        }
+    }
+    glob.to_string_lossy().into_owned()
 }
 
 #[cfg(test)]

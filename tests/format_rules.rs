@@ -7,7 +7,6 @@ mod forgery;
 #[path = "../fuzz/common/reseal.rs"]
 mod reseal;
 #[path = "common/vdb_writer.rs"]
-#[allow(dead_code)] // Other tests fill boxes.
 mod vdb_writer;
 
 use std::collections::BTreeSet;

@@ -39,6 +39,7 @@ fn read_grid(file: &VdbFile, grid: &GridInfo) -> bool {
         return refused(&error);
     }
     grid.transform.matrix.as_ref().map(volpack::vdb::voxel_size);
+    grid.obstacle();
     if !grid.value_type.is_scalar() {
         return true;
     }

@@ -1,16 +1,20 @@
 //! `volpack init`.
 
-use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::io::Write as _;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use rayon::prelude::*;
 
 use super::style::{TITLE, WARNING};
 use super::{Common, outln};
 use crate::error::{Error, Result};
 use crate::manifest::DEFAULT_NAME;
+use crate::sequence::{Numbering, Sequence, number, sequences};
+use crate::settings::Integers;
+use crate::stages::flatten::nonfinite_background;
+use crate::stages::select::{FrameGrids, find as find_grid, listing, select_from};
 use crate::units::count;
 use crate::vdb::{GridInfo, VdbFile};
 
@@ -30,15 +34,18 @@ pub struct InitArgs {
     folder: PathBuf,
 }
 
-/// Files whose names differ in their last run of digits alone.
-struct Sequence {
-    /// Patterns, or the file if there is one.
-    frames: Vec<String>,
-    grids: Vec<GridInfo>,
-}
+/// Grids of a liquid's surface, as Blender and FLIP Fluids call them.
+const LIQUID_GRIDS: [&str; 2] = ["phi", "surface"];
 
-/// A file's folder, and what comes before and after the last run of digits of its name.
-type Family = (PathBuf, String, String);
+/// A sequence that a pack can be built of.
+struct Buildable {
+    /// The grids of its first frame.
+    grids: Vec<GridInfo>,
+    /// Those of them that can be packed.
+    packable: Vec<String>,
+    /// The grid to name; none where the one that a build chooses is meant.
+    grid: Option<String>,
+}
 
 pub fn run(args: &InitArgs, common: Common) -> Result<()> {
     let manifest = args.folder.join(DEFAULT_NAME);
@@ -47,34 +54,35 @@ pub fn run(args: &InitArgs, common: Common) -> Result<()> {
     if files.is_empty() {
         return Err(Error::Input(format!("{}: there is no .vdb file in it", args.folder.display())));
     }
-    let mut families: BTreeMap<Family, Vec<(usize, PathBuf)>> = BTreeMap::new();
-    for file in files {
-        let (family, digits) = family(&file);
-        families.entry(family).or_default().push((digits, file));
-    }
     let mut text = format!("{}\n", keys());
     let mut names = Vec::new();
-    for (family, mut files) in families {
-        files.sort();
-        let first = args.folder.join(&files[0].1);
-        let grids = match VdbFile::open(&first) {
-            Ok(file) => file.grids,
-            Err(error) => {
-                anstream::eprintln!("{WARNING}warning{WARNING:#}: left out: {}: {error}", first.display());
-                continue;
+    let mut refusals = Vec::new();
+    for sequence in sequences(&files) {
+        let name = unique(&sequence, &names);
+        let asset = asset(&name, &sequence);
+        match buildable(&args.folder, &sequence) {
+            Ok(found) => {
+                if !common.quiet {
+                    let unit = if sequence.files.len() == 1 { "file" } else { "files" };
+                    let files = count(sequence.files.len() as u64);
+                    outln!("{TITLE}{name}{TITLE:#}: {files} {unit}: {}", listing(&found.grids));
+                }
+                let _ = write!(text, "\n{asset}{}", found.settings());
             }
-        };
-        let name = unique(&family, &names);
-        let sequence = Sequence { frames: frames(&family, &files), grids };
-        if !common.quiet {
-            let unit = if files.len() == 1 { "file" } else { "files" };
-            outln!("{TITLE}{name}{TITLE:#}: {} {unit}: {}", count(files.len() as u64), sequence.listing());
+            Err(error) => {
+                anstream::eprintln!("{WARNING}warning{WARNING:#}: left out: {error}");
+                let lines = asset.lines().map(|line| format!("# {line}\n")).collect::<String>();
+                let _ = write!(text, "\n# Left out: {}\n{lines}", one_line(&error.to_string()));
+                refusals.push(error);
+            }
         }
-        text.push_str(&sequence.asset(&name));
         names.push(name);
     }
-    if names.is_empty() {
-        return Err(Error::Input(format!("{}: no .vdb file in it can be read", args.folder.display())));
+    if refusals.len() == names.len() {
+        let nothing =
+            Error::Unsupported(format!("{}: no .vdb file in it can be packed", args.folder.display()));
+        let all_are_unsupported = refusals.iter().all(|e| e.exit_code() == nothing.exit_code());
+        return Err(if all_are_unsupported { nothing } else { Error::Input(nothing.to_string()) });
     }
     // Another manifest is someone's work.
     let created = std::fs::OpenOptions::new().write(true).create_new(true).open(&manifest);
@@ -110,38 +118,110 @@ fn find(root: &Path, folder: &Path, depth: usize, out: &mut Vec<PathBuf>) -> Res
     Ok(())
 }
 
-/// A file's family, and how many digits its number has.
-fn family(file: &Path) -> (Family, usize) {
-    let folder = file.parent().unwrap_or(Path::new("")).to_owned();
-    let name = file.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let stem = name.rsplit_once('.').map_or(&*name, |(stem, _)| stem);
-    let end = stem.rfind(|c: char| c.is_ascii_digit()).map_or(0, |at| at + 1);
-    let start = stem[..end].trim_end_matches(|c: char| c.is_ascii_digit()).len();
-    let (before, after) = if end == 0 { (&*name, "") } else { (&name[..start], &name[end..]) };
-    ((folder, before.to_owned(), after.to_owned()), end - start)
+/// What a pack could be built of, as far as the files' headers tell.
+fn buildable(root: &Path, sequence: &Sequence) -> Result<Buildable> {
+    let files: Vec<PathBuf> = sequence.files.iter().map(|file| root.join(file)).collect();
+    let Numbering { numbers, .. } = number(&files)?;
+    let grids = in_each(&files, |file, _| Ok(file.grids))?;
+    let frames: Vec<FrameGrids> = files
+        .iter()
+        .zip(&numbers)
+        .zip(&grids)
+        .map(|((path, &number), grids)| FrameGrids { path, number, grids })
+        .collect();
+    let can_be_packed = |grid: &&str| select_from(&frames, &[(*grid).to_owned()], Integers::Keep).is_ok();
+    let in_file = || frames[0].grids.iter().map(|g| &*g.name);
+    let (grid, selection) = match select_from(&frames, &[], Integers::Keep) {
+        Ok(selection) => (None, selection),
+        Err(error) => {
+            let chosen = LIQUID_GRIDS.into_iter().chain(in_file()).find(can_be_packed).ok_or(error)?;
+            (Some(chosen.to_owned()), select_from(&frames, &[chosen.to_owned()], Integers::Keep)?)
+        }
+    };
+    in_each(&files, |file, path| {
+        for grid in selection.grids.iter().filter_map(|selected| find_grid(&file.grids, &selected.name)) {
+            let background = file.background(grid).map_err(Error::vdb(path))? as f32;
+            if !background.is_finite() {
+                return Err(nonfinite_background(path, grid, background));
+            }
+        }
+        Ok(())
+    })?;
+    let packable = in_file().filter(can_be_packed).map(str::to_owned).collect();
+    Ok(Buildable { packable, grid, grids: frames[0].grids.to_vec() })
 }
 
-/// What stands for a family's files: one file by its name, several by a pattern for each number of digits. Not `*`: that
-/// would take in the files of `smoke_low_0001.vdb` with those of `smoke_0001.vdb`.
-fn frames((folder, before, after): &Family, files: &[(usize, PathBuf)]) -> Vec<String> {
+/// What `read` makes of each file, or the error of the first that is wrong.
+fn in_each<T: Send>(files: &[PathBuf], read: impl Fn(VdbFile, &Path) -> Result<T> + Sync) -> Result<Vec<T>> {
+    let read =
+        |path: &PathBuf| VdbFile::open(path).map_err(Error::vdb(path)).and_then(|file| read(file, path));
+    files.par_iter().map(read).collect::<Vec<_>>().into_iter().collect()
+}
+
+impl Buildable {
+    /// Its grids in a manifest.
+    fn settings(&self) -> String {
+        let mut out = format!("# grids: {}\n", one_line(&listing(&self.grids)));
+        match &self.grid {
+            Some(grid) => {
+                let _ = writeln!(out, "grid = {}", quoted(grid));
+            }
+            None if self.packable.len() > 1 => {
+                let all: Vec<_> = self.packable.iter().map(|g| quoted(g)).collect();
+                let _ = writeln!(out, "# grids = [{}]", all.join(", "));
+            }
+            None => {}
+        }
+        out
+    }
+}
+
+/// A sequence as an asset of a manifest, without its grids.
+fn asset(name: &str, sequence: &Sequence) -> String {
+    let frames = match &frames(sequence)[..] {
+        [one] => quoted(one),
+        several => format!("[{}]", several.iter().map(|f| quoted(f)).collect::<Vec<_>>().join(", ")),
+    };
+    format!("[asset.{name}]\nframes = {frames}\noutput = \"packs/{name}.volpack\"\n")
+}
+
+/// What stands for a sequence's files: one file by its name, several by globs.
+fn frames(sequence: &Sequence) -> Vec<String> {
     // A manifest's paths have slashes on every system.
     let text = |path: &Path| path.to_string_lossy().replace('\\', "/");
-    if let [(_, only)] = files {
+    if let [only] = &sequence.files[..] {
         return vec![text(only)];
     }
-    let mut widths: Vec<usize> = files.iter().map(|(digits, _)| *digits).collect();
-    widths.dedup();
     let escaped = |part: &str| glob::Pattern::escape(part);
-    let pattern = |digits| format!("{}{}{}", escaped(before), "[0-9]".repeat(digits), escaped(after));
-    let folder = PathBuf::from(escaped(&folder.to_string_lossy()));
-    widths.into_iter().map(|digits| text(&folder.join(pattern(digits)))).collect()
+    let [before, after] = [&sequence.before, &sequence.after].map(|part| escaped(part));
+    let folder = PathBuf::from(escaped(&sequence.folder.to_string_lossy()));
+    sequence
+        .number_globs
+        .iter()
+        .map(|number| text(&folder.join(format!("{before}{number}{after}"))))
+        .collect()
 }
 
-/// A name for an asset: what comes before the digits, or the folder's.
-fn unique((folder, before, _): &Family, taken: &[String]) -> String {
-    let before = before.strip_suffix(".vdb").unwrap_or(before).trim_matches(['_', '-', '.', ' ']);
-    let of_folder = folder.file_name().unwrap_or_default().to_string_lossy();
-    let name = if before.is_empty() { &*of_folder } else { before };
+/// A name for an asset: that of the files without the frame number, or the folder's. What is a part of one file's name may
+/// not be a frame number: digits go only from behind a separator at its end.
+fn unique(sequence: &Sequence, taken: &[String]) -> String {
+    let separators = ['_', '-', '.', ' '];
+    let without_extension = |name: &str| name.rsplit_once('.').map_or("", |(stem, _)| stem).to_owned();
+    let (before, after) = match &sequence.files[..] {
+        [only] => {
+            let stem = only.file_stem().unwrap_or_default().to_string_lossy();
+            let name = stem.trim_end_matches(|c: char| c.is_ascii_digit());
+            let is_numbered = name.is_empty() || name.ends_with(separators);
+            (if is_numbered { name } else { &stem }.to_owned(), String::new())
+        }
+        _ => (sequence.before.clone(), without_extension(&sequence.after)),
+    };
+    let of_folder = sequence.folder.file_name().unwrap_or_default().to_string_lossy();
+    let name = match (before.trim_matches(separators), after.trim_matches(separators)) {
+        ("", "") => of_folder.into_owned(),
+        ("", one) | (one, "") => one.to_owned(),
+        (before, after) => format!("{before}_{after}"),
+    };
     let bare = |c: char| if c.is_ascii_alphanumeric() || c == '_' || c == '-' { c } else { '_' };
     let name: String = name.chars().map(bare).collect();
     let name = if name.is_empty() { "volume".to_owned() } else { name };
@@ -150,38 +230,9 @@ fn unique((folder, before, _): &Family, taken: &[String]) -> String {
     candidates.find(|c| !taken.contains(c)).expect("numbers do not end")
 }
 
-impl Sequence {
-    fn listing(&self) -> String {
-        let one = |g: &GridInfo| format!("{} ({})", g.name, g.value_type.name());
-        if self.grids.is_empty() {
-            return "no grids".to_owned();
-        }
-        self.grids.iter().map(one).collect::<Vec<_>>().join(", ")
-    }
-
-    fn asset(&self, name: &str) -> String {
-        let frames = match &self.frames[..] {
-            [one] => quoted(one),
-            several => format!("[{}]", several.iter().map(|f| quoted(f)).collect::<Vec<_>>().join(", ")),
-        };
-        let packable: Vec<&str> =
-            self.grids.iter().filter(|g| g.value_type.is_scalar()).map(|g| g.name.as_str()).collect();
-        let mut out = format!("\n[asset.{name}]\nframes = {frames}\n");
-        let _ = writeln!(out, "# grids: {}", self.listing().replace(['\n', '\r'], " "));
-        match packable[..] {
-            [] => out.push_str("# none of them can be packed\n"),
-            [_] => {}
-            _ if packable.contains(&"density") => {
-                let all: Vec<_> = packable.iter().map(|g| quoted(g)).collect();
-                let _ = writeln!(out, "# grids = [{}]", all.join(", "));
-            }
-            [first, ..] => {
-                let _ = writeln!(out, "grid = {}", quoted(first));
-            }
-        }
-        let _ = writeln!(out, "output = \"packs/{name}.volpack\"");
-        out
-    }
+/// Text as it can stand in a comment.
+fn one_line(text: &str) -> String {
+    text.replace(|c: char| c.is_control(), " ")
 }
 
 fn quoted(text: &str) -> String {

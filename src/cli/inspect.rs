@@ -6,12 +6,13 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 
-use super::style::{ERROR, TITLE};
+use super::style::{ERROR, TITLE, WARNING};
 use super::{outln, print_json};
 use crate::error::{Error, Result};
 use crate::pack::{Pack, layout};
-use crate::report::{GridSummary, PackSummary, VdbSummary};
+use crate::report::{GridSummary, PackSummary, TopologySummary, VdbSummary};
 use crate::units::{bytes, count};
+use crate::vdb::ValueType;
 
 #[derive(Args)]
 pub struct InspectArgs {
@@ -46,6 +47,10 @@ pub fn run(args: &InspectArgs) -> Result<()> {
 }
 
 fn is_pack(path: &Path) -> Result<bool> {
+    // Which not every system opens: the reader of .vdb files tells what is wrong.
+    if path.is_dir() {
+        return Ok(false);
+    }
     let mut magic = Vec::new();
     let file = File::open(path).map_err(Error::io(path))?;
     file.take(layout::MAGIC.len() as u64).read_to_end(&mut magic).map_err(Error::io(path))?;
@@ -60,6 +65,9 @@ fn print_vdb(path: &Path, file: &VdbSummary) {
         file.version,
         file.library
     );
+    for warning in &file.warnings {
+        outln!("  {WARNING}warning{WARNING:#}: {warning}");
+    }
     if file.grids.is_empty() {
         outln!("  no grids");
     }
@@ -69,27 +77,35 @@ fn print_vdb(path: &Path, file: &VdbSummary) {
 }
 
 fn print_grid(g: &GridSummary) {
-    let half = if g.half { " (half)" } else { "" };
-    let packable = if g.packable { "" } else { ", cannot be packed" };
-    outln!("\n  {TITLE}{}{TITLE:#}: {}{half}, {}{packable}", g.name, g.value_type, g.class);
+    let half = if g.half && g.value_type != ValueType::Half.name() { " (half)" } else { "" };
+    outln!("\n  {TITLE}{}{TITLE:#}: {}{half}, {}", g.name, g.value_type, g.class);
+    if let Some(obstacle) = &g.obstacle {
+        outln!("    cannot be packed: it {obstacle}");
+    }
     outln!("    map           {}", g.map);
-    outln!("    background    {}", g.background);
-    let tiles = [("4096³", g.root_tiles), ("128³", g.l1_tiles), ("8³", g.l2_tiles)];
-    let tiles: Vec<_> =
-        tiles.iter().filter(|(_, n)| *n > 0).map(|(dim, n)| format!("{} of {dim}", count(*n))).collect();
-    let tiles = if tiles.is_empty() { "none".to_owned() } else { tiles.join(", ") };
-    outln!("    leaves        {}", count(g.leaves));
-    outln!("    active tiles  {tiles}");
-    outln!("    active voxels {}", count(g.active_voxels));
-    if g.active_voxels > 0 {
-        let [a, b, c, d, e, f] = g.bbox;
-        outln!("    box           [{a}, {b}, {c}] to [{d}, {e}, {f}]");
+    if let Some(topology) = &g.topology {
+        print_topology(topology);
     }
     if let Some(v) = &g.values {
         outln!("    values        {} to {}, sum {}", v.min, v.max, v.sum);
         if v.nonfinite != 0 {
             outln!("    not finite    {}", v.nonfinite);
         }
+    }
+}
+
+fn print_topology(t: &TopologySummary) {
+    outln!("    background    {}", t.background);
+    let tiles = [("4096³", t.root_tiles), ("128³", t.l1_tiles), ("8³", t.l2_tiles)];
+    let tiles: Vec<_> =
+        tiles.iter().filter(|(_, n)| *n > 0).map(|(dim, n)| format!("{} of {dim}", count(*n))).collect();
+    let tiles = if tiles.is_empty() { "none".to_owned() } else { tiles.join(", ") };
+    outln!("    leaves        {}", count(t.leaves));
+    outln!("    active tiles  {tiles}");
+    outln!("    active voxels {}", count(t.active_voxels));
+    if t.active_voxels > 0 {
+        let [a, b, c, d, e, f] = t.bbox;
+        outln!("    box           [{a}, {b}, {c}] to [{d}, {e}, {f}]");
     }
 }
 

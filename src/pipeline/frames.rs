@@ -21,7 +21,7 @@ use crate::volume::{Blocks, Brick, FlatFrame};
 /// What frames pass through before anything is made of them.
 pub type Alter<'a> = &'a (dyn Fn(&mut FlatFrame) + Sync);
 
-const OUTLINE: Stage = Stage { name: "outline", version: 3, travels: false };
+const OUTLINE: Stage = Stage { name: "outline", version: 4, travels: false };
 
 /// One grid of one frame, with its voxels unless they were not needed so far.
 type Frame = (Outline, Option<Blocks<Brick>>);

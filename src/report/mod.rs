@@ -21,7 +21,7 @@ pub use html::html;
 pub use junit::junit;
 pub use markdown::markdown;
 pub use pack::{CodecSummary, PackSummary};
-pub use vdb::{GridSummary, ValueSummary, VdbSummary};
+pub use vdb::{GridSummary, TopologySummary, ValueSummary, VdbSummary};
 
 use crate::pack::{Pack, Provenance};
 use crate::settings::Budget;

@@ -17,6 +17,8 @@ pub struct VdbSummary {
     pub library: String,
     /// What wrote it, if it says.
     pub creator: Option<String>,
+    /// What may keep some of it from being read.
+    pub warnings: Vec<String>,
     /// Its grids.
     pub grids: Vec<GridSummary>,
 }
@@ -39,6 +41,19 @@ pub struct GridSummary {
     pub matrix: Option<[f64; 16]>,
     /// Whether volpack can pack it.
     pub packable: bool,
+    /// Why not, to be said of the grid.
+    pub obstacle: Option<String>,
+    /// What its tree holds; not there for a tree whose layout is not known.
+    #[serde(flatten, skip_serializing_if = "Option::is_none")]
+    pub topology: Option<TopologySummary>,
+    /// What the voxels say, where they were asked for.
+    #[serde(flatten, skip_serializing_if = "Option::is_none")]
+    pub values: Option<ValueSummary>,
+}
+
+/// What a grid's tree holds.
+#[derive(Clone, Debug, Serialize)]
+pub struct TopologySummary {
     /// The background value.
     pub background: Json,
     /// Leaf nodes.
@@ -54,9 +69,6 @@ pub struct GridSummary {
     /// The active voxels' box: minimum, then maximum, inclusive; OpenVDB's empty box if there are
     /// none.
     pub bbox: [i32; 6],
-    /// What the voxels say, where they were asked for.
-    #[serde(flatten, skip_serializing_if = "Option::is_none")]
-    pub values: Option<ValueSummary>,
 }
 
 /// What a grid's voxels say, over active values with tiles included.
@@ -87,40 +99,50 @@ impl VdbSummary {
         let creator =
             file.metadata.iter().find(|(name, _)| name == "creator").map(|(_, value)| value.clone());
         let (major, minor) = file.library;
-        Ok(Self { version: file.version, library: format!("{major}.{minor}"), creator, grids })
+        let library = format!("{major}.{minor}");
+        Ok(Self { version: file.version, library, creator, warnings: file.warnings, grids })
     }
 }
 
 fn summarise(file: &VdbFile, path: &Path, grid: &GridInfo, values: bool) -> Result<GridSummary> {
-    let read_error = || Error::vdb(path);
-    let values = values && grid.value_type.is_scalar();
-    if values {
-        return with_scalar_type!(&grid.value_type,
-            T => file.read_tree::<T>(grid).map_err(read_error()).map(|tree| {
-                let values = value_summary(&tree);
-                GridSummary { values: Some(values), ..topology_summary(grid, &tree) }
-            }),
-            _other => unreachable!("the type is scalar")
-        );
-    }
-    with_value_type!(&grid.value_type,
-        T => file.read_topology::<T>(grid).map_err(read_error()).map(|tree| topology_summary(grid, &tree)),
-        name => Err(Error::Unsupported(format!(
-            "{}: grid {:?} is a {name}, a tree whose layout volpack does not know", path.display(), grid.name
-        )))
-    )
-}
-
-fn topology_summary<T: Value>(grid: &GridInfo, tree: &Tree<T>) -> GridSummary {
-    let stats = tree.topology_stats();
-    GridSummary {
+    let obstacle = grid.obstacle();
+    let mut summary = GridSummary {
         name: grid.name.clone(),
         value_type: grid.value_type.name().to_owned(),
         half: grid.half,
         class: grid.class.name(),
         map: grid.transform.map.clone(),
         matrix: grid.transform.matrix,
-        packable: grid.value_type.is_scalar() && grid.transform.matrix.is_some(),
+        packable: obstacle.is_none(),
+        obstacle,
+        topology: None,
+        values: None,
+    };
+    let read_error = || Error::vdb(path);
+    if values && grid.value_type.is_scalar() {
+        with_scalar_type!(&grid.value_type,
+            T => {
+                let tree = file.read_tree::<T>(grid).map_err(read_error())?;
+                summary.topology = Some(topology_summary(&tree));
+                summary.values = Some(value_summary(&tree));
+            },
+            _other => unreachable!("the type is scalar")
+        );
+    } else {
+        with_value_type!(&grid.value_type,
+            T => {
+                let tree = file.read_topology::<T>(grid).map_err(read_error())?;
+                summary.topology = Some(topology_summary(&tree));
+            },
+            _name => {}
+        );
+    }
+    Ok(summary)
+}
+
+fn topology_summary<T: Value>(tree: &Tree<T>) -> TopologySummary {
+    let stats = tree.topology_stats();
+    TopologySummary {
         background: tree.background.to_json(),
         leaves: stats.leaves,
         active_voxels: stats.active_voxels,
@@ -128,7 +150,6 @@ fn topology_summary<T: Value>(grid: &GridInfo, tree: &Tree<T>) -> GridSummary {
         l1_tiles: stats.l1_tiles,
         l2_tiles: stats.l2_tiles,
         bbox: stats.bbox.to_array(),
-        values: None,
     }
 }
 

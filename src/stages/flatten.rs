@@ -35,16 +35,29 @@ pub fn flatten(
         other => unreachable!("{} grids are refused when grids are selected", other.name())
     );
     let count = flat.frame.stats.nonfinite;
+    if nonfinite == NonFinite::Refuse && !flat.background.is_finite() {
+        return Err(nonfinite_background(path, grid, flat.background));
+    }
     if count > 0 && nonfinite == NonFinite::Refuse {
         let voxels = if count == 1 { "value that is" } else { "values that are" };
         return Err(Error::Input(format!(
             "{}: grid {:?} has {count} {voxels} infinite or not a number: \
-             repair the export, or set nonfinite = \"zero\"",
+             repair the export, or take 0 for each (--nonfinite zero, or nonfinite = \"zero\" in the manifest)",
             path.display(),
             grid.name
         )));
     }
     Ok(flat)
+}
+
+/// A background that is infinite or not a number.
+pub fn nonfinite_background(path: &std::path::Path, grid: &GridInfo, background: f32) -> Error {
+    Error::Input(format!(
+        "{}: grid {:?} has the background {background}: repair the export, or take 0 for every value that is infinite \
+         or not a number (--nonfinite zero, or nonfinite = \"zero\" in the manifest)",
+        path.display(),
+        grid.name
+    ))
 }
 
 /// What becomes of a leaf.

@@ -1,5 +1,6 @@
 //! Stage 1: read every file's header and grid descriptors, no voxels.
 
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
@@ -7,6 +8,7 @@ use rayon::prelude::*;
 
 use crate::cache::{Cache, Stamp};
 use crate::error::{Error, Result};
+use crate::sequence::{Numbering, number};
 use crate::vdb::{GridInfo, VdbFile};
 
 /// One file of a sequence.
@@ -55,7 +57,7 @@ impl FrameSource {
 pub struct SequenceInfo {
     /// At least one.
     pub frames: Vec<FrameSource>,
-    /// What is odd about the sequence: missing numbers, names without one.
+    /// What is odd about the sequence: missing frames, names without a number, files that may not be read right.
     pub warnings: Vec<String>,
 }
 
@@ -76,30 +78,39 @@ pub fn read(paths: &[PathBuf], digests: Digests) -> Result<SequenceInfo> {
     if paths.is_empty() {
         return Err(Error::Input("there are no frames to read".to_owned()));
     }
-    let mut warnings = Vec::new();
-    let numbers = frame_numbers(paths, &mut warnings)?;
-    let mut frames = paths
+    let Numbering { numbers, mut warnings } = number(paths)?;
+    let read = paths
         .par_iter()
         .zip(numbers)
         .map(|(path, number)| read_one(path, number, digests))
         .collect::<Vec<_>>()
         .into_iter()
         .collect::<Result<Vec<_>>>()?;
+    warnings.extend(file_warnings(&read));
+    let mut frames: Vec<FrameSource> = read.into_iter().map(|(frame, _)| frame).collect();
     frames.sort_by_key(|f| f.number);
-    if let Some(pair) = frames.windows(2).find(|w| w[0].number == w[1].number) {
-        return Err(Error::Input(format!(
-            "{} and {} are both frame {}: name the files of one sequence",
-            pair[0].path.display(),
-            pair[1].path.display(),
-            pair[0].number
-        )));
-    }
-    let numbers: Vec<i32> = frames.iter().map(|f| f.number).collect();
-    warnings.extend(missing_frames(&numbers));
     Ok(SequenceInfo { frames, warnings })
 }
 
-fn read_one(path: &Path, number: i32, digests: Digests) -> Result<FrameSource> {
+/// What is odd about files, once for all of which the same is.
+fn file_warnings(files: &[(FrameSource, Vec<String>)]) -> Vec<String> {
+    let mut files_of: BTreeMap<&str, Vec<&FrameSource>> = BTreeMap::new();
+    for (file, warnings) in files {
+        warnings.iter().for_each(|warning| files_of.entry(warning).or_default().push(file));
+    }
+    let one = |(warning, files): (&str, Vec<&FrameSource>)| {
+        let first = files[0].path.display();
+        match files.len() - 1 {
+            0 => format!("{first}: {warning}"),
+            1 => format!("{first} and another file: {warning}"),
+            others => format!("{first} and {others} other files: {warning}"),
+        }
+    };
+    files_of.into_iter().map(one).collect()
+}
+
+/// One file, and what is odd about it.
+fn read_one(path: &Path, number: i32, digests: Digests) -> Result<(FrameSource, Vec<String>)> {
     let stamp = Stamp::of(path).map_err(Error::io(path))?;
     let file = VdbFile::open(path).map_err(Error::vdb(path))?;
     let is_settled = stamp.is_settled();
@@ -107,7 +118,7 @@ fn read_one(path: &Path, number: i32, digests: Digests) -> Result<FrameSource> {
     let source = FrameSource { path: path.to_owned(), number, digest, stamp, is_settled, grids: file.grids };
     // What was read and what was hashed are one file.
     source.check_stamp()?;
-    Ok(source)
+    Ok((source, file.warnings))
 }
 
 impl Digests<'_> {
@@ -140,70 +151,4 @@ pub fn digest(path: &Path) -> Result<(blake3::Hash, u64)> {
 
 fn file_name(path: &Path) -> String {
     path.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default()
-}
-
-/// Each file's frame number: the last run of digits in its name. A single file without one is frame
-/// 0; several are numbered in the given order.
-fn frame_numbers(paths: &[PathBuf], warnings: &mut Vec<String>) -> Result<Vec<i32>> {
-    let found: Vec<_> = paths.iter().map(|p| frame_number(p)).collect();
-    if let Some(numbers) = found.iter().copied().collect::<Option<Vec<_>>>() {
-        return Ok(numbers);
-    }
-    if paths.len() > 1 {
-        let unnumbered = found.iter().position(Option::is_none).expect("not every name has a number");
-        warnings.push(format!(
-            "{} has no frame number in its name: the files are numbered in the order given",
-            file_name(&paths[unnumbered])
-        ));
-    }
-    (0..paths.len())
-        .map(|i| i32::try_from(i).map_err(|_| Error::Usage("too many frames".to_owned())))
-        .collect()
-}
-
-fn frame_number(path: &Path) -> Option<i32> {
-    let stem = path.file_stem()?.to_string_lossy();
-    let digits_end = stem.rfind(|c: char| c.is_ascii_digit())? + 1;
-    let digits = stem[..digits_end].rsplit(|c: char| !c.is_ascii_digit()).next()?;
-    digits.parse().ok()
-}
-
-/// Numbers listed in one warning; more are only counted.
-const LISTED: usize = 10;
-
-fn missing_frames(numbers: &[i32]) -> Option<String> {
-    let gaps = numbers.windows(2).map(|w| (w[0] + 1, w[1] - 1)).filter(|(first, last)| first <= last);
-    let mut count = 0i64;
-    let mut names = Vec::new();
-    for (first, last) in gaps {
-        count += i64::from(last) - i64::from(first) + 1;
-        names.push(if first == last { first.to_string() } else { format!("{first}-{last}") });
-    }
-    let rest = names.len().saturating_sub(LISTED);
-    names.truncate(LISTED);
-    let more = if rest > 0 { format!(" and {rest} more gaps") } else { String::new() };
-    let frames = if count == 1 { "frame is" } else { "frames are" };
-    (count > 0).then(|| format!("{count} {frames} missing from the sequence: {}{more}", names.join(", ")))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_last_digits_of_a_name_are_its_frame() {
-        let number = |name: &str| frame_number(Path::new(name));
-        assert_eq!(number("shot2/plume_0012.vdb"), Some(12));
-        assert_eq!(number("fire2_v03.0100.vdb"), Some(100));
-        assert_eq!(number("take7_smoke.vdb"), Some(7));
-        assert_eq!(number("smoke.vdb"), None);
-        assert_eq!(number("99999999999.vdb"), None);
-    }
-
-    #[test]
-    fn gaps_are_named() {
-        assert_eq!(missing_frames(&[1, 2, 3]), None);
-        assert_eq!(missing_frames(&[1, 3]).unwrap(), "1 frame is missing from the sequence: 2");
-        assert_eq!(missing_frames(&[1, 3, 7]).unwrap(), "4 frames are missing from the sequence: 2, 4-6");
-    }
 }

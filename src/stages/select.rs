@@ -1,5 +1,7 @@
 //! Stage 2: choose the grids, check that all frames agree.
 
+use std::path::Path;
+
 use crate::error::{Error, Result};
 use crate::settings::Integers;
 use crate::stages::component::{Component, packed_as};
@@ -35,20 +37,40 @@ pub struct SelectedGrid {
     pub frames: Vec<usize>,
 }
 
+/// One file of a sequence, as far as grids are chosen by it.
+#[derive(Clone, Copy)]
+pub struct FrameGrids<'a> {
+    /// The file.
+    pub path: &'a Path,
+    /// Its frame number.
+    pub number: i32,
+    /// The grids in it.
+    pub grids: &'a [GridInfo],
+}
+
 /// Chooses `names`, or where there are none `density`, or else the only grid that can be packed.
 ///
 /// # Errors
 /// A grid that no frame has, that cannot be packed, or whose frames disagree about what it is.
 pub fn select(sequence: &SequenceInfo, names: &[String], integers: Integers) -> Result<Selection> {
-    let names = if names.is_empty() { vec![default_grid(sequence)?] } else { names.to_vec() };
+    let frames = sequence.frames.iter();
+    let frames = frames.map(|f| FrameGrids { path: &f.path, number: f.number, grids: &f.grids });
+    select_from(&frames.collect::<Vec<_>>(), names, integers)
+}
+
+/// The same from frames, of which there is at least one, in their order.
+///
+/// # Errors
+/// As [`select`].
+pub fn select_from(frames: &[FrameGrids], names: &[String], integers: Integers) -> Result<Selection> {
+    let names = if names.is_empty() { vec![default_grid(frames)?] } else { names.to_vec() };
     let mut selection = Selection { grids: Vec::new(), warnings: Vec::new() };
     for (i, name) in names.iter().enumerate() {
         if names[..i].contains(name) {
             return Err(Error::Usage(format!("grid {name:?} is asked for twice")));
         }
-        let whole = select_one(sequence, name, &mut selection.warnings)?;
-        let first =
-            find(&sequence.frames[whole.frames[0]].grids, name).expect("it was selected in this frame");
+        let whole = select_one(frames, name, &mut selection.warnings)?;
+        let first = find(frames[whole.frames[0]].grids, name).expect("it was selected in this frame");
         for (name, component) in packed_as(first, integers) {
             if selection.grids.iter().any(|grid| grid.name == name) {
                 return Err(Error::Usage(format!(
@@ -70,31 +92,33 @@ pub fn find<'a>(grids: &'a [GridInfo], name: &str) -> Option<&'a GridInfo> {
         .or_else(|| grids.iter().find(|g| g.name.strip_prefix(name).is_some_and(|rest| rest == "[0]")))
 }
 
-fn default_grid(sequence: &SequenceInfo) -> Result<String> {
-    let all = || sequence.frames.iter().flat_map(|f| &f.grids);
-    if sequence.frames.iter().any(|f| find(&f.grids, DEFAULT_GRID).is_some()) {
+fn default_grid(frames: &[FrameGrids]) -> Result<String> {
+    let all = frames.iter().flat_map(|f| f.grids);
+    if frames.iter().any(|f| find(f.grids, DEFAULT_GRID).is_some()) {
         return Ok(DEFAULT_GRID.to_owned());
     }
-    let mut scalar: Vec<&str> = all().filter(|g| g.value_type.is_scalar()).map(|g| g.name.as_str()).collect();
-    scalar.sort_unstable();
-    scalar.dedup();
-    match scalar[..] {
+    let obstacle = all.clone().find_map(|g| Some(format!("; {:?} {}", g.name, g.obstacle()?)));
+    let mut packable: Vec<&str> = all.filter(|g| g.obstacle().is_none()).map(|g| g.name.as_str()).collect();
+    packable.sort_unstable();
+    packable.dedup();
+    match packable[..] {
         [one] => Ok(one.to_owned()),
-        [] => Err(Error::Input(format!(
-            "{}: no grid can be packed: the file has {}",
-            sequence.frames[0].path.display(),
-            listing(&sequence.frames[0].grids)
+        [] => Err(Error::Unsupported(format!(
+            "{}: no grid can be packed: the file has {}{}",
+            frames[0].path.display(),
+            listing(frames[0].grids),
+            obstacle.unwrap_or_default()
         ))),
         _ => Err(Error::Usage(format!(
             "{}: there is no grid \"density\" and more than one other could be packed: \
              choose with --grid (or grid = \"…\" in the manifest) from {}",
-            sequence.frames[0].path.display(),
-            scalar.join(", ")
+            frames[0].path.display(),
+            packable.join(", ")
         ))),
     }
 }
 
-fn select_one(sequence: &SequenceInfo, name: &str, warnings: &mut Vec<String>) -> Result<SelectedGrid> {
+fn select_one(frames: &[FrameGrids], name: &str, warnings: &mut Vec<String>) -> Result<SelectedGrid> {
     let mut selected = SelectedGrid {
         name: name.to_owned(),
         source: name.to_owned(),
@@ -105,27 +129,22 @@ fn select_one(sequence: &SequenceInfo, name: &str, warnings: &mut Vec<String>) -
     };
     let mut first: Option<&GridInfo> = None;
     let mut missing = Vec::new();
-    for (i, frame) in sequence.frames.iter().enumerate() {
-        let Some(grid) = find(&frame.grids, name) else {
+    for (i, frame) in frames.iter().enumerate() {
+        let Some(grid) = find(frame.grids, name) else {
             missing.push(frame.number.to_string());
             continue;
         };
-        let refuse =
-            |why: String| Err(Error::Unsupported(format!("{}: grid {name:?} {why}", frame.path.display())));
-        if !grid.value_type.is_scalar() {
-            let packable: Vec<_> =
-                frame.grids.iter().filter(|g| g.value_type.is_scalar()).map(|g| g.name.as_str()).collect();
-            return refuse(format!(
-                "is {}, and only float, half, double, int32 and int64 grids can be packed: {}",
-                grid.value_type.name(),
-                if packable.is_empty() { "this file has none".to_owned() } else { packable.join(", ") }
-            ));
-        }
-        if grid.transform.matrix.is_none() {
-            return refuse(format!(
-                "has a {}, and only linear maps can be packed: resample it to a uniform grid",
-                grid.transform.map
-            ));
+        if let Some(obstacle) = grid.obstacle() {
+            let packable = frame.grids.iter().filter(|g| g.obstacle().is_none());
+            let packable: Vec<_> = packable.map(|g| g.name.as_str()).collect();
+            let instead = match packable[..] {
+                [] => String::new(),
+                _ => format!("; choose from {}", packable.join(", ")),
+            };
+            return Err(Error::Unsupported(format!(
+                "{}: grid {name:?} {obstacle}{instead}",
+                frame.path.display()
+            )));
         }
         let before = first.get_or_insert(grid);
         if grid.value_type.is_integer() != before.value_type.is_integer()
@@ -155,11 +174,11 @@ fn select_one(sequence: &SequenceInfo, name: &str, warnings: &mut Vec<String>) -
         selected.frames.push(i);
     }
     if selected.frames.is_empty() {
-        let first = &sequence.frames[0];
+        let first = &frames[0];
         return Err(Error::Usage(format!(
             "{}: no grid {name:?}: the file has {}",
             first.path.display(),
-            listing(&first.grids)
+            listing(first.grids)
         )));
     }
     if !missing.is_empty() {
@@ -168,7 +187,8 @@ fn select_one(sequence: &SequenceInfo, name: &str, warnings: &mut Vec<String>) -
     Ok(selected)
 }
 
-fn listing(grids: &[GridInfo]) -> String {
+/// The names and types of a file's grids.
+pub fn listing(grids: &[GridInfo]) -> String {
     if grids.is_empty() {
         return "no grids".to_owned();
     }

@@ -4,6 +4,7 @@
 //! thread and its leaves are then decoded by all of them.
 
 use super::blosc;
+use super::codec::{Codec, Decompressors};
 use super::cursor::Cursor;
 use super::value::Value;
 use super::{Result, VdbError};
@@ -60,16 +61,11 @@ enum Packing {
 }
 
 /// A thread's buffers for [`Block::decode`].
+#[derive(Default)]
 pub(super) struct Scratch {
     bytes: Vec<u8>,
     blosc: blosc::Scratch,
-    zip: flate2::Decompress,
-}
-
-impl Default for Scratch {
-    fn default() -> Self {
-        Self { bytes: Vec::new(), blosc: blosc::Scratch::default(), zip: flate2::Decompress::new(true) }
-    }
+    decompressors: Decompressors,
 }
 
 impl<'a, T: Value> Block<'a, T> {
@@ -167,23 +163,17 @@ impl<'a, T: Value> Block<'a, T> {
     }
 
     fn unpack<'s>(&'s self, len: usize, scratch: &'s mut Scratch) -> Result<&'s [u8]> {
-        let Scratch { bytes, blosc, zip } = scratch;
+        let Scratch { bytes, blosc, decompressors } = scratch;
         match self.packing {
             Packing::Raw => return Ok(self.payload),
             Packing::Blosc => {
                 bytes.resize(len, 0);
-                blosc::decompress(self.payload, bytes, blosc).map_err(|e| VdbError::corrupt(self.at, e))?;
+                blosc::decompress(self.at, self.payload, bytes, blosc, decompressors)?;
             }
             Packing::Zip => {
                 bytes.resize(len, 0);
-                zip.reset(true);
-                let end = zip.decompress(self.payload, bytes, flate2::FlushDecompress::Finish);
-                if !matches!(end, Ok(flate2::Status::StreamEnd)) || zip.total_out() != len as u64 {
-                    return Err(VdbError::corrupt(
-                        self.at,
-                        format!("zip data does not unpack to {len} bytes"),
-                    ));
-                }
+                let unpacked = Codec::Zlib.decompress(self.payload, bytes, decompressors);
+                unpacked.map_err(|what| VdbError::corrupt(self.at, what))?;
             }
         }
         Ok(bytes)

@@ -37,6 +37,11 @@ impl<'a> Cursor<'a> {
         self.pos
     }
 
+    /// The next `n` bytes, or as many as there are.
+    pub fn peek(&self, n: usize) -> &'a [u8] {
+        &self.bytes[self.pos..self.bytes.len().min(self.pos + n)]
+    }
+
     pub fn take(&mut self, n: u64, what: &'static str) -> Result<&'a [u8]> {
         if n > self.remaining() as u64 {
             return Err(VdbError::Truncated { what, at: self.at(), need: n, left: self.remaining() as u64 });

@@ -1,5 +1,8 @@
 //! What can be wrong with an OpenVDB file.
 
+use super::file::NEWEST;
+use super::other_format::OtherFormat;
+
 /// Why an OpenVDB file, or one grid of it, could not be read.
 #[derive(Debug, thiserror::Error)]
 pub enum VdbError {
@@ -7,14 +10,26 @@ pub enum VdbError {
     #[error(transparent)]
     Io(#[from] std::io::Error),
     /// The magic number is missing.
-    #[error("not an OpenVDB file: it does not begin with OpenVDB's magic number")]
-    NotVdb,
-    /// A file version outside 222 to 225.
+    #[error("not an OpenVDB file: {0}")]
+    NotVdb(OtherFormat),
+    /// A file version that is too old.
     #[error(
-        "OpenVDB file version {0} is not supported, only 222 to 225: \
-         open the file in a current Houdini, Blender or vdb_tool and save it again"
+        "OpenVDB file version {0} is too old, volpack reads 222 and later: \
+         open the file with a program that has OpenVDB 12 or older, as Blender 4 has, and save it again"
     )]
-    Version(u32),
+    TooOld(u32),
+    /// What cannot be read in a file of a version that is not known.
+    #[error(
+        "{source}: the file's OpenVDB file version {version} is newer than {newest}, the newest that this volpack knows: \
+         use a newer volpack, or write the file with an older OpenVDB",
+        newest = NEWEST
+    )]
+    Newer {
+        /// The file's version.
+        version: u32,
+        /// What could not be read.
+        source: Box<VdbError>,
+    },
     /// The file ends too early, or a length or offset in it points past its end.
     #[error("{what} at byte {at} needs {need} bytes, but only {left} are left")]
     Truncated {
@@ -57,10 +72,26 @@ impl VdbError {
         Self::Grid { grid: grid.to_owned(), source: Box::new(self) }
     }
 
+    /// What is wrong with a file of a version, which may be why.
+    pub(super) fn in_version(self, version: u32) -> Self {
+        if version > NEWEST && !self.is_io() {
+            return Self::Newer { version, source: Box::new(self) };
+        }
+        self
+    }
+
+    fn is_io(&self) -> bool {
+        match self {
+            Self::Io(_) => true,
+            Self::Grid { source, .. } => source.is_io(),
+            _ => false,
+        }
+    }
+
     /// Whether the file is sound but holds something that volpack does not read.
     pub fn is_unsupported(&self) -> bool {
         match self {
-            Self::Unsupported(_) | Self::Version(_) => true,
+            Self::Unsupported(_) | Self::TooOld(_) | Self::Newer { .. } => true,
             Self::Grid { source, .. } => source.is_unsupported(),
             _ => false,
         }

@@ -50,7 +50,7 @@ pub struct GridInfo {
     pub name: String,
     /// The type of its voxels.
     pub value_type: ValueType,
-    /// Whether the file has its real values as 16-bit floats.
+    /// Whether real values are stored as 16-bit floats; of other types it says nothing.
     pub half: bool,
     /// What kind of field it holds.
     pub class: GridClass,
@@ -67,8 +67,11 @@ pub struct GridInfo {
 
 /// Separates a repeated name from its number (`GridDescriptor`'s `SEP`).
 const SUFFIX: char = '\x1e';
-/// Marks a grid type whose values are stored as half floats.
-const HALF: &str = "_HalfFloat";
+/// Behind the type of a grid that is saved as half floats. OpenVDB takes it off and believes the metadata alone, also
+/// where there is none: then values are stored in full.
+const HALF_SUFFIX: &str = "_HalfFloat";
+/// Metadata: whether real values are stored as half floats.
+const SAVED_AS_HALF: &str = "is_saved_as_half_float";
 
 /// A grid's descriptor: OpenVDB's `GridDescriptor`.
 pub(super) struct Descriptor {
@@ -102,19 +105,37 @@ impl Descriptor {
 }
 
 impl GridInfo {
+    /// Why the grid cannot be packed, to be said of it; `None` if it can be.
+    pub fn obstacle(&self) -> Option<String> {
+        match &self.value_type {
+            ValueType::Other(tree) => {
+                Some(format!("is of type {tree}, and volpack does not know how such trees are laid out"))
+            }
+            other if !other.is_scalar() => Some(format!(
+                "is {}, and only half, float, double, int32 and int64 grids can be packed",
+                other.name()
+            )),
+            _ if self.transform.matrix.is_none() => Some(format!(
+                "has a {}, and only grids with linear maps can be packed: resample it to a uniform grid",
+                self.transform.map
+            )),
+            _ => None,
+        }
+    }
+
     /// Reads what stands between a descriptor and its tree: compression, metadata, transform. The
     /// tree's range is left from there to `end`.
     pub(super) fn read(c: &mut Cursor, descriptor: &Descriptor, earlier: &[Self], end: u64) -> Result<Self> {
         let compression = Compression::read(c)?;
-        let class = read_metadata(c)?
-            .into_iter()
-            .find(|(name, _)| name == "class")
-            .map_or(GridClass::Unknown, |(_, class)| GridClass::from_name(&class));
+        let metadata = read_metadata(c)?;
+        // Of several entries of a name OpenVDB keeps the last.
+        let last = |name: &str| metadata.iter().rfind(|entry| entry.name == name);
+        let class = last("class").and_then(Metadata::text);
+        let class = class.map_or(GridClass::Unknown, |class| GridClass::from_name(&class));
+        let half = last(SAVED_AS_HALF).is_some_and(Metadata::is_true);
         let transform = Transform::read(c)?;
-        let tree_type = &descriptor.tree_type;
-        let (tree_type, half) =
-            tree_type.strip_suffix(HALF).map_or((tree_type.as_str(), false), |tree_type| (tree_type, true));
-        let value_type = ValueType::from_tree_type(tree_type);
+        let tree_type = &*descriptor.tree_type;
+        let value_type = ValueType::from_tree_type(tree_type.strip_suffix(HALF_SUFFIX).unwrap_or(tree_type));
         let parent = &descriptor.instance_parent;
         let instance_of = if parent.is_empty() {
             None
@@ -143,16 +164,35 @@ impl GridInfo {
     }
 }
 
-/// Reads a `MetaMap` and keeps what is text.
-pub(super) fn read_metadata(c: &mut Cursor) -> Result<Vec<(String, String)>> {
+/// An entry of a `MetaMap`.
+pub(super) struct Metadata<'a> {
+    pub name: String,
+    kind: String,
+    value: &'a [u8],
+}
+
+impl Metadata<'_> {
+    /// The value if it is text.
+    pub fn text(&self) -> Option<String> {
+        (self.kind == "string").then(|| String::from_utf8_lossy(self.value).into_owned())
+    }
+
+    /// OpenVDB's `Metadata::asBool`: of a number of any type, whether it is not zero.
+    fn is_true(&self) -> bool {
+        self.value.iter().any(|&byte| byte != 0)
+    }
+}
+
+/// Reads a `MetaMap` and keeps what is text, and whether values are halves.
+pub(super) fn read_metadata<'a>(c: &mut Cursor<'a>) -> Result<Vec<Metadata<'a>>> {
     let mut out = Vec::new();
     for _ in 0..c.u32("the metadata count")? {
         let name = c.string("a metadata name")?;
         let kind = c.string("a metadata type")?;
         let size = c.u32("a metadata size")?;
         let value = c.take(size.into(), "a metadata value")?;
-        if kind == "string" {
-            out.push((name, String::from_utf8_lossy(value).into_owned()));
+        if kind == "string" || name == SAVED_AS_HALF {
+            out.push(Metadata { name, kind, value });
         }
     }
     Ok(out)

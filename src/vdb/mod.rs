@@ -4,17 +4,19 @@
 //! [`VdbFile::open`] reads the header, every grid's descriptor, metadata and transform, and no
 //! voxels. [`VdbFile::read_tree`] then reads one grid; the others are not touched. The format is
 //! OpenVDB's `io/Archive`, `io/Compression.h` and the tree nodes' `readTopology` / `readBuffers`,
-//! file versions 222 to 225.
+//! file versions 222 to 225. Later versions are read as 225, with a warning, as OpenVDB reads them.
 //!
 //! Any byte may be wrong: every length and offset is checked against the file's size before memory
 //! is taken for it, and decompression goes into buffers of a size known beforehand.
 
 mod block;
 mod blosc;
+mod codec;
 mod cursor;
 mod error;
 mod file;
 mod grid;
+mod other_format;
 mod stats;
 mod transform;
 mod tree;
@@ -24,6 +26,8 @@ mod value;
 pub use error::VdbError;
 pub use file::VdbFile;
 pub use grid::{GridClass, GridInfo};
+pub use half::f16;
+pub use other_format::OtherFormat;
 pub use stats::{TopologyStats, ValueStats};
 pub use transform::{Transform, voxel_size};
 pub use tree::{Accessor, Internal, LEAVES_IN_BLOCK, Leaves, RootTile, TileAt, Tree, TreeSize};

@@ -12,15 +12,20 @@ use super::value::{Value, ValueType};
 use super::{Result, VdbError};
 use crate::volume::{BRICK_DIM, BRICK_VOXELS, CELL_DIM, Coord, Mask512, ROOT_DIM, bits};
 
-/// Reads the tree whose first byte is at the cursor and leaves the cursor behind its topology: masks
-/// and tile values, but no leaf values.
-pub(super) fn read_topology<T: Value>(c: &mut Cursor, grid: &GridInfo) -> Result<Tree<T>> {
+/// Reads the background of the tree whose first byte is at the cursor.
+pub(super) fn read_background<T: Value>(c: &mut Cursor) -> Result<T> {
     let at = c.at();
     let buffers = c.u32("the tree's buffer count")?;
     if buffers != 1 {
         return Err(VdbError::corrupt(at, format!("{buffers} buffers a tree, not 1")));
     }
-    let background = T::from_le(c.take(T::SIZE as u64, "the background value")?);
+    Ok(T::from_le(c.take(T::SIZE as u64, "the background value")?))
+}
+
+/// Reads the tree whose first byte is at the cursor and leaves the cursor behind its topology: masks
+/// and tile values, but no leaf values.
+pub(super) fn read_topology<T: Value>(c: &mut Cursor, grid: &GridInfo) -> Result<Tree<T>> {
+    let background = read_background(c)?;
     let mut reader = Reader { layout: layout(grid, background), scratch: Scratch::default() };
     let mut tree = Tree {
         background,

@@ -6,6 +6,7 @@ use half::f16;
 #[derive(Clone, Debug, PartialEq, Eq)]
 #[allow(missing_docs)] // The variants are OpenVDB's own type names.
 pub enum ValueType {
+    Half,
     Float,
     Double,
     Int32,
@@ -25,6 +26,7 @@ impl ValueType {
     pub fn from_tree_type(tree_type: &str) -> Self {
         let known = tree_type.strip_prefix("Tree_").and_then(|t| t.strip_suffix("_5_4_3"));
         match known {
+            Some("half") => Self::Half,
             Some("float") => Self::Float,
             Some("double") => Self::Double,
             Some("int32") => Self::Int32,
@@ -42,6 +44,7 @@ impl ValueType {
     /// OpenVDB's name of the type.
     pub fn name(&self) -> &str {
         match self {
+            Self::Half => "half",
             Self::Float => "float",
             Self::Double => "double",
             Self::Int32 => "int32",
@@ -58,7 +61,7 @@ impl ValueType {
 
     /// Whether grids of this type can be packed.
     pub fn is_scalar(&self) -> bool {
-        matches!(self, Self::Float | Self::Double | Self::Int32 | Self::Int64)
+        matches!(self, Self::Half | Self::Float | Self::Double | Self::Int32 | Self::Int64)
     }
 
     /// Whether its values are integers that can be packed.
@@ -165,6 +168,34 @@ scalar!(f64, |v| -v, half = f16::to_f64);
 scalar!(i32, i32::wrapping_neg, integer = i64::from);
 scalar!(i64, i64::wrapping_neg, integer = |v| v);
 
+/// OpenVDB 13's `HalfGrid`. Its values have two bytes whether or not the grid says that it is saved as half floats.
+impl Value for f16 {
+    const SIZE: usize = 2;
+    #[inline]
+    fn from_le(bytes: &[u8]) -> Self {
+        Self::from_le_bytes(bytes.try_into().expect("SIZE bytes"))
+    }
+    fn negative(self) -> Self {
+        -self
+    }
+    fn to_json(self) -> serde_json::Value {
+        Scalar::to_f32(self).into()
+    }
+}
+
+impl Scalar for f16 {
+    const FITS_F32: bool = true;
+
+    #[inline]
+    fn to_f32(self) -> f32 {
+        self.into()
+    }
+    #[inline]
+    fn to_f64(self) -> f64 {
+        self.into()
+    }
+}
+
 impl Value for bool {
     const SIZE: usize = 1;
     fn from_le(bytes: &[u8]) -> Self {
@@ -216,6 +247,10 @@ macro_rules! __with_value_type {
     ($value_type:expr, $T:ident => $body:expr, $name:ident => $other:expr) => {{
         use $crate::vdb::ValueType as V;
         match $value_type {
+            V::Half => {
+                type $T = $crate::vdb::f16;
+                $body
+            }
             V::Float => {
                 type $T = f32;
                 $body
@@ -264,6 +299,10 @@ macro_rules! __with_scalar_type {
     ($value_type:expr, $T:ident => $body:expr, $other_type:ident => $other:expr) => {{
         use $crate::vdb::ValueType as V;
         match $value_type {
+            V::Half => {
+                type $T = $crate::vdb::f16;
+                $body
+            }
             V::Float => {
                 type $T = f32;
                 $body

@@ -1,7 +1,9 @@
 //! Writes small OpenVDB files, so that a test can make exactly the input that it is about.
 //!
 //! The layout is that of OpenVDB's `io/Archive.cc` and the tree nodes' `writeTopology` / `writeBuffers`, file version
-//! 224: inner nodes with mask compression and nothing but background in their tiles, leaves with all 512 values.
+//! 224 unless asked for another: inner nodes with mask compression and nothing but background in their tiles, leaves with all 512 values.
+
+#![allow(dead_code)] // Each test file uses a part of it.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -11,6 +13,8 @@ use volpack::volume::{BRICK_VOXELS, Coord, Mask512};
 
 /// `io::COMPRESS_ACTIVE_MASK`.
 const ACTIVE_MASK: u32 = 2;
+/// `io::COMPRESS_BLOSC`.
+pub const BLOSC: u32 = 4;
 /// A node's value modes: inactive values are the background; every value is stored.
 const BACKGROUND: u8 = 0;
 const ALL_VALUES: u8 = 6;
@@ -33,7 +37,16 @@ pub struct GridFile<V> {
     pub translation: [f64; 3],
     /// Leaves by their smallest corner, a multiple of 8: values x slowest, and which of them are active.
     pub leaves: BTreeMap<Coord, ([V; BRICK_VOXELS], Mask512)>,
+    /// `io::COMPRESS_*` flags beside that of active masks.
+    pub compression: u32,
+    /// A leaf's values as the file has them.
+    pub stored: fn(&[V]) -> Vec<u8>,
+    /// What lies between the last leaf's values and the grid's end.
+    pub left_over: Vec<u8>,
 }
+
+/// A grid's name, its type, and its bytes behind the descriptor.
+pub type Part = (String, String, Vec<u8>);
 
 impl<V: Pod> GridFile<V> {
     /// A grid without leaves.
@@ -47,6 +60,9 @@ impl<V: Pod> GridFile<V> {
             voxel_size: 0.1,
             translation: [0.0; 3],
             leaves: BTreeMap::new(),
+            compression: 0,
+            stored: |values| bytemuck::cast_slice(values).to_vec(),
+            left_over: Vec::new(),
         }
     }
 
@@ -78,10 +94,15 @@ impl<V: Pod> GridFile<V> {
         self
     }
 
-    /// The grid behind its descriptor, and what lies between its beginning and its leaves' values.
+    /// The grid as a part of a file.
+    pub fn part(&self) -> Part {
+        (self.name.clone(), self.tree_type.clone(), self.body())
+    }
+
+    /// The grid behind its descriptor.
     fn body(&self) -> Vec<u8> {
         let mut out = Vec::new();
-        out.extend(ACTIVE_MASK.to_le_bytes());
+        out.extend((self.compression | ACTIVE_MASK).to_le_bytes());
         out.extend(((self.metadata.len() + self.flags.len()) as u32).to_le_bytes());
         for (key, value) in &self.metadata {
             for part in [key, "string", value] {
@@ -101,6 +122,7 @@ impl<V: Pod> GridFile<V> {
             (0..3).for_each(|_| out.extend(value.to_le_bytes()));
         }
         self.tree(&mut out);
+        out.extend(&self.left_over);
         out
     }
 
@@ -118,9 +140,9 @@ impl<V: Pod> GridFile<V> {
         let mut order = Vec::new();
         for (root, cells) in &roots {
             root.0.iter().for_each(|v| out.extend(v.to_le_bytes()));
-            inner_node(out, cells.keys().map(|cell| cell.child_index(5, 128)), 1 << 15);
+            self.inner_node(out, cells.keys().map(|cell| cell.child_index(5, 128)), 1 << 15);
             for leaves in cells.values() {
-                inner_node(out, leaves.iter().map(|leaf| leaf.child_index(4, 8)), 1 << 12);
+                self.inner_node(out, leaves.iter().map(|leaf| leaf.child_index(4, 8)), 1 << 12);
                 for leaf in leaves {
                     out.extend(self.leaves[leaf].1.to_words().iter().flat_map(|word| word.to_le_bytes()));
                     order.push(*leaf);
@@ -131,18 +153,22 @@ impl<V: Pod> GridFile<V> {
             let (values, active) = &self.leaves[&leaf];
             out.extend(active.to_words().iter().flat_map(|word| word.to_le_bytes()));
             out.push(ALL_VALUES);
-            out.extend_from_slice(bytemuck::cast_slice(values));
+            out.extend((self.stored)(values));
         }
     }
-}
 
-/// An inner node of so many places with children at some of them, and tiles of inactive background at the others.
-fn inner_node(out: &mut Vec<u8>, children: impl Iterator<Item = usize>, places: usize) {
-    let mut mask = vec![0u8; places / 8];
-    children.for_each(|place| mask[place / 8] |= 1 << (place % 8));
-    out.extend(&mask);
-    out.extend(vec![0u8; places / 8]);
-    out.push(BACKGROUND);
+    /// An inner node of so many places with children at some of them, and tiles of inactive background at the others.
+    fn inner_node(&self, out: &mut Vec<u8>, children: impl Iterator<Item = usize>, places: usize) {
+        let mut mask = vec![0u8; places / 8];
+        children.for_each(|place| mask[place / 8] |= 1 << (place % 8));
+        out.extend(&mask);
+        out.extend(vec![0u8; places / 8]);
+        out.push(BACKGROUND);
+        if self.compression != 0 {
+            // No value is stored, which takes no bytes.
+            out.extend(0i64.to_le_bytes());
+        }
+    }
 }
 
 fn string(out: &mut Vec<u8>, text: &str) {
@@ -150,26 +176,25 @@ fn string(out: &mut Vec<u8>, text: &str) {
     out.extend(text.as_bytes());
 }
 
-/// A file of some grids, each by its name, its type and its [`GridFile::body`].
-fn file(version: u32, grids: &[(&str, &str, Vec<u8>)]) -> Vec<u8> {
+/// The bytes of a file of some grids.
+pub fn file(version: u32, has_offsets: bool, grids: &[Part]) -> Vec<u8> {
     let mut out = Vec::new();
     out.extend(0x5644_4220u64.to_le_bytes());
     for word in [version, 10, 0] {
         out.extend(word.to_le_bytes());
     }
-    // It has offsets.
-    out.push(1);
+    out.push(u8::from(has_offsets));
     out.extend(b"00000000-0000-0000-0000-000000000000");
     out.extend(0u32.to_le_bytes());
     out.extend((grids.len() as i32).to_le_bytes());
     for (name, tree_type, body) in grids {
-        for part in [name, tree_type, ""] {
+        for part in [&**name, tree_type, ""] {
             string(&mut out, part);
         }
         let start = out.len() as u64 + 24;
         // Where its blocks begin is not used by any reader.
         for offset in [start, start, start + body.len() as u64] {
-            out.extend(offset.to_le_bytes());
+            out.extend(if has_offsets { offset } else { 0 }.to_le_bytes());
         }
         out.extend(body);
     }
@@ -178,7 +203,7 @@ fn file(version: u32, grids: &[(&str, &str, Vec<u8>)]) -> Vec<u8> {
 
 /// The bytes of a file of one grid.
 pub fn one_grid<V: Pod>(grid: &GridFile<V>) -> Vec<u8> {
-    file(224, &[(&grid.name, &grid.tree_type, grid.body())])
+    file(224, true, &[grid.part()])
 }
 
 /// Writes a file of one grid.
