@@ -49,7 +49,7 @@ pub mod settings;
 pub mod stages;
 pub mod sweep;
 pub mod trace;
-mod units;
+pub mod units;
 pub mod vdb;
 pub mod verify;
 pub mod volume;

@@ -158,10 +158,10 @@ fn there_is_no_surface_where_nothing_is_negative() {
     let ball =
         |v: [i32; 3]| (v.iter().map(|x| (f64::from(*x) - 11.0).powi(2)).sum::<f64>().sqrt() - 6.3) as f32;
     // Plateaus of 0 between positive values, values next to 0, and a ball that touches nothing.
-    let cases: [(&dyn Fn([i32; 3]) -> f32, bool); 3] =
-        [(&plateaus, false), (&|v| small(v) * 1e-7, false), (&ball, true)];
-    for (value, has_surface) in cases {
-        let frames = write(folder.path(), &[level_set(value)]);
+    let cases =
+        [(level_set(plateaus), false), (level_set(|v| small(v) * 1e-7), false), (level_set(ball), true)];
+    for (grid, has_surface) in cases {
+        let frames = write(folder.path(), &[grid]);
         let pack = built(&frames, settings(Format::F32), folder.path());
         let field = field(&pack, 0);
         for interpolation in [Interpolation::Trilinear, Interpolation::Nearest] {

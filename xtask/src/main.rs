@@ -6,6 +6,7 @@
 mod beside;
 mod cache;
 mod clusters;
+mod corpus;
 mod formats;
 mod kmeans;
 mod load;
@@ -37,6 +38,8 @@ enum Task {
     /// Measure, side by side with a peer or a setting
     #[command(subcommand)]
     Bench(Bench),
+    /// Pack every sequence below some folders in every way, and list what was refused: run before each release
+    Corpus(corpus::Args),
     /// Draw the chart of a sweep anew from its JSON
     Chart {
         /// The `sweep.json` of a `volpack sweep`
@@ -99,6 +102,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         Task::Bench(Bench::Size(args)) => size::bench(&args),
         Task::Bench(Bench::Pictures(args)) => pictures::bench(&args),
         Task::Bench(Bench::Trace(args)) => trace::bench(&args),
+        Task::Corpus(args) => corpus::run(&args),
         Task::Chart { json, svg } => chart(&json, &svg),
         Task::CheckOpenvdb { files } => openvdb::check(&files),
         Task::StressCache(args) => stress::run(&args),
