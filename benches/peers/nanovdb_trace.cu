@@ -1,16 +1,25 @@
 // Traces a NanoVDB grid of floats, or of FpN, with NanoVDB's own HDDA and accessor, along the rays that volpack traces.
 //
-//     nanovdb_trace GRID.nvdb fog|nearest|trilinear WIDTH HEIGHT REPEATS PICTURE < rays
+//     nanovdb_trace GRID.nvdb fog|nearest|trilinear WIDTH HEIGHT PICTURE
 //
-// `rays` is numbers: origin, the middle ray, and from there to the right edge and to the top (three each, in
-// index space; unless it is trilinear, a voxel is the cube from its coordinate to the next). PICTURE gets one
-// f32 a pixel, in voxels: the integral of density over the ray, or the distance to the first zero of a level
-// set, -1 without one: where a voxel's sign is another (nearest), or of the interpolant of eight (trilinear).
-// Standard output gets the milliseconds of each frame.
+// Standard input has the rays first: origin, the middle ray, and from there to the right edge and to the top (three
+// numbers each, in index space; unless it is trilinear, a voxel is the cube from its coordinate to the next). Then each
+// number is how many frames to trace: standard output gets the milliseconds of each, a line each. At the end of the
+// input, PICTURE gets one f32 a pixel, in voxels: the integral of density over the ray, or the distance to the first
+// zero of a level set, -1 without one: where a voxel's sign is another (nearest), or of the interpolant of eight
+// (trilinear). Without arguments it prints NanoVDB's version.
 
+#if __has_include(<nanovdb/math/HDDA.h>) // from 32.7 on
+#include <nanovdb/io/IO.h>
+#include <nanovdb/math/HDDA.h>
+#include <nanovdb/math/Ray.h>
+namespace math = nanovdb::math;
+#else
 #include <nanovdb/util/HDDA.h>
 #include <nanovdb/util/IO.h>
 #include <nanovdb/util/Ray.h>
+namespace math = nanovdb;
+#endif
 
 #include <cstdio>
 #include <cstdlib>
@@ -19,13 +28,13 @@
 #include <string>
 #include <vector>
 
-using nanovdb::Coord;
+using math::Coord;
 template <typename Build>
 using Grid = nanovdb::NanoGrid<Build>;
 template <typename Build>
 using Accessor = nanovdb::DefaultReadAccessor<Build>;
-using Ray = nanovdb::Ray<float>;
-using Vec = nanovdb::Vec3<float>;
+using Ray = math::Ray<float>;
+using Vec = math::Vec3<float>;
 
 static void check(cudaError_t error)
 {
@@ -57,8 +66,8 @@ __device__ float fog(const Grid<Build>& grid, Ray ray)
     auto accessor = grid.tree().getAccessor();
     if (!ray.clip(accessor.root().bbox()))
         return 0;
-    Coord ijk = nanovdb::RoundDown<Coord>(ray(ray.t0() + 1e-4f));
-    nanovdb::HDDA<Ray, Coord> hdda(ray, accessor.getDim(ijk, ray));
+    Coord ijk = math::RoundDown<Coord>(ray(ray.t0() + 1e-4f));
+    math::HDDA<Ray, Coord> hdda(ray, accessor.getDim(ijk, ray));
     float depth = 0;
     bool inside = true;
     while (inside) {
@@ -66,7 +75,7 @@ __device__ float fog(const Grid<Build>& grid, Ray ray)
         if (hdda.dim() == 1 && accessor.isActive(ijk))
             depth += accessor.getValue(ijk) * (end - start);
         inside = hdda.step();
-        ijk = nanovdb::RoundDown<Coord>(ray(hdda.time() + 1e-3f));
+        ijk = math::RoundDown<Coord>(ray(hdda.time() + 1e-3f));
         hdda.update(ray, accessor.getDim(ijk, ray));
     }
     return depth;
@@ -80,7 +89,7 @@ __device__ float nearest(const Grid<Build>& grid, Ray ray)
     auto accessor = grid.tree().getAccessor();
     Coord ijk;
     float value, t = 0;
-    return nanovdb::ZeroCrossing(ray, accessor, ijk, value, t) ? t : -1;
+    return math::ZeroCrossing(ray, accessor, ijk, value, t) ? t : -1;
 }
 
 // The eight voxels from ijk on, ordered by x + 2y + 4z: straight from a leaf that holds them all.
@@ -160,14 +169,14 @@ __device__ float trilinear(const Grid<Build>& grid, Ray ray)
     auto accessor = grid.tree().getAccessor();
     if (!ray.clip(accessor.root().bbox()))
         return -1;
-    Coord ijk = nanovdb::RoundDown<Coord>(ray(ray.t0() + 1e-3f));
-    nanovdb::HDDA<Ray, Coord> hdda(ray, accessor.getDim(ijk, ray));
+    Coord ijk = math::RoundDown<Coord>(ray(ray.t0() + 1e-3f));
+    math::HDDA<Ray, Coord> hdda(ray, accessor.getDim(ijk, ray));
     const bool negative = accessor.getValue(ijk) < 0;
     bool found = false;
     float start = 0, length = 0, low = 0, high = 0;
     Cubic cubic;
     for (bool inside = true; inside && !found;) {
-        ijk = nanovdb::RoundDown<Coord>(ray(hdda.time() + 1e-3f));
+        ijk = math::RoundDown<Coord>(ray(hdda.time() + 1e-3f));
         hdda.update(ray, accessor.getDim(ijk, ray));
         if (hdda.dim() == 1 && accessor.isActive(ijk)) {
             do {
@@ -222,8 +231,11 @@ Kernel kernel_of(const std::string& shows)
 
 int main(int count, char** arguments)
 {
-    if (count != 7)
-        return 2;
+    if (count == 1)
+        std::printf("%d.%d.%d\n", NANOVDB_MAJOR_VERSION_NUMBER, NANOVDB_MINOR_VERSION_NUMBER,
+            NANOVDB_PATCH_VERSION_NUMBER);
+    if (count != 6)
+        return count == 1 ? 0 : 2;
     View view;
     for (Vec* vector : { &view.origin, &view.forward, &view.right, &view.up })
         if (!(std::cin >> (*vector)[0] >> (*vector)[1] >> (*vector)[2]))
@@ -231,7 +243,6 @@ int main(int count, char** arguments)
     const std::string shows = arguments[2];
     view.width = std::atoi(arguments[3]);
     view.height = std::atoi(arguments[4]);
-    const int repeats = std::atoi(arguments[5]);
 
     auto handle = nanovdb::io::readGrid(arguments[1]);
     if (!handle.grid<float>() && !handle.grid<nanovdb::FpN>())
@@ -251,15 +262,18 @@ int main(int count, char** arguments)
     // Trilinear is 4 % faster in blocks of 8 × 16 than of 8 × 8.
     const dim3 block(8, shows == "trilinear" ? 16 : 8);
     const dim3 blocks((view.width + 7) / 8, (view.height + block.y - 1) / block.y);
-    for (int i = 0; i < repeats; i++) {
-        check(cudaEventRecord(start));
-        kernel<<<blocks, block>>>(grid, view, pixels);
-        check(cudaEventRecord(end));
-        check(cudaEventSynchronize(end));
-        float milliseconds;
-        check(cudaEventElapsedTime(&milliseconds, start, end));
-        std::printf("%.6f\n", milliseconds);
+    for (int frames; std::cin >> frames;) {
+        for (int i = 0; i < frames; i++) {
+            check(cudaEventRecord(start));
+            kernel<<<blocks, block>>>(grid, view, pixels);
+            check(cudaEventRecord(end));
+            check(cudaEventSynchronize(end));
+            float milliseconds;
+            check(cudaEventElapsedTime(&milliseconds, start, end));
+            std::printf("%.6f\n", milliseconds);
+        }
+        std::fflush(stdout);
     }
     check(cudaMemcpy(picture.data(), pixels, bytes, cudaMemcpyDeviceToHost));
-    std::ofstream(arguments[6], std::ios::binary).write(reinterpret_cast<char*>(picture.data()), bytes);
+    std::ofstream(arguments[5], std::ios::binary).write(reinterpret_cast<char*>(picture.data()), bytes);
 }

@@ -34,10 +34,10 @@ pub struct SweepArgs {
     /// What to do with infinities and NaNs
     #[arg(long, default_value = "refuse")]
     nonfinite: NonFinite,
-    /// How often builds and pictures are timed: the fastest build and the median picture count
+    /// How often builds and pictures are timed at least: the fastest build and the median picture count
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=1000))]
     repeats: u32,
-    /// Pixels of the traced pictures; 0 0 to trace none
+    /// Pixels of the pictures that are traced where there is a GPU; 0 0 to trace none
     #[arg(long, num_args = 2, value_names = ["WIDTH", "HEIGHT"], default_values_t = [960, 540])]
     trace: Vec<u32>,
 }
@@ -159,6 +159,9 @@ fn write_sweep(options: &Options, sweep: &Sweep, folder: &Path) -> Result<Vec<St
         })
         .collect();
     lines.extend(skipped(&sweep.skipped));
+    if options.trace.is_some() && sweep.device.is_none() {
+        lines.push("  no GPU here: no picture was traced".to_owned());
+    }
     Ok(lines)
 }
 

@@ -51,6 +51,8 @@ pub enum GpuError {
 pub struct Gpu {
     /// The adapter's name.
     pub name: String,
+    /// Whether it is a program on the CPU, whose times say nothing of a GPU.
+    pub is_software: bool,
     device: wgpu::Device,
     queue: wgpu::Queue,
     pipelines: Pipelines,
@@ -120,7 +122,8 @@ impl Gpu {
         }))
         .map_err(|e| GpuError::Failed(e.to_string()))?;
         let pipelines = Pipelines::new(&device);
-        Ok(Self { name: info.name, device, queue, pipelines, timestamps })
+        let is_software = info.device_type == wgpu::DeviceType::Cpu;
+        Ok(Self { name: info.name, is_software, device, queue, pipelines, timestamps })
     }
 
     /// Uploads a pack's tree and texture pages.

@@ -6,6 +6,7 @@ pub mod nanovdb;
 mod noise;
 mod points;
 mod stability;
+mod steady;
 
 use std::path::PathBuf;
 
@@ -20,6 +21,7 @@ pub use cheaper::cheaper;
 pub use field::{Difference, Jumps};
 pub use points::{difference, measure};
 pub use stability::stability;
+pub use steady::{Steady, steady};
 
 /// What is measured, and how.
 #[derive(Clone, Debug)]
@@ -120,7 +122,7 @@ impl Options {
         let settings = Settings { quality, ..self.settings(Format::Adaptive) };
         let (method, setting) = match quality {
             Quality::Psnr(db) => ("adaptive", format!("psnr = {db}")),
-            Quality::ByClass { .. } => ("adaptive", "default".to_owned()),
+            Quality::ByClass { .. } => ("default", "adaptive".to_owned()),
             other => ("adaptive max-error", other.to_string().replacen("max-error ", "max error = ", 1)),
         };
         Method { method, setting, settings }
@@ -141,6 +143,7 @@ impl Options {
     pub fn methods(&self) -> Vec<Method> {
         let mut methods: Vec<Method> =
             (30..=70).step_by(5).map(|db| self.adaptive(Quality::Psnr(db.into()))).collect();
+        methods.push(self.adaptive(Quality::default()));
         methods.extend(
             [0.02, 0.01, 0.005, 0.001].map(|e| self.adaptive(Quality::MaxError(ErrorBound::of_range(e)))),
         );
@@ -156,8 +159,8 @@ impl Options {
     pub fn repeated_methods(&self) -> Vec<Method> {
         vec![
             self.adaptive(Quality::Psnr(35.0)),
+            self.adaptive(Quality::Psnr(45.0)),
             self.adaptive(Quality::default()),
-            self.adaptive(Quality::Psnr(55.0)),
             self.adaptive(Quality::MaxError(ErrorBound::of_range(0.01))),
             self.uniform(Format::Unorm8),
             self.sequence_range(Format::Unorm8),

@@ -5,6 +5,7 @@ use std::time::Instant;
 
 use super::field::{Bricks, Difference, Jumps};
 use super::nanovdb::{self, NanoError, Quantise};
+use super::steady::steady;
 use super::{Method, Options, Skipped, Sweep, each};
 use crate::error::{Error, Result};
 use crate::pack::Pack;
@@ -30,7 +31,7 @@ const FPN: [f64; 6] = [0.1, 0.05, 0.02, 0.01, 0.005, 0.002];
 /// When a source cannot be read or packed.
 pub fn measure(options: &Options, progress: &mut dyn Progress) -> Result<Sweep> {
     let scratch = tempfile::tempdir().map_err(Error::io(std::env::temp_dir()))?;
-    let gpu = options.trace.and_then(|_| Gpu::shared().ok());
+    let gpu = options.trace.and_then(|_| Gpu::shared().ok()).filter(|gpu| !gpu.is_software);
     let source = Source::read(options)?;
     let methods = options.methods();
     let (mut points, mut skipped) =
@@ -159,10 +160,7 @@ fn point(
     })
 }
 
-/// Milliseconds of pictures after which a GPU that was idle has its clocks up.
-const WARM_MS: f64 = 500.0;
-
-/// The median milliseconds of the last frame's picture; `None` where the device cannot hold or time it.
+/// The milliseconds of the last frame's picture; `None` where the device cannot hold it, or times nothing.
 fn trace(gpu: &Gpu, pack: &Pack, size: [u32; 2], repeats: u32) -> Option<f64> {
     let uploaded = gpu.upload(pack).ok()?;
     let grid = &pack.grids[0];
@@ -170,14 +168,9 @@ fn trace(gpu: &Gpu, pack: &Pack, size: [u32; 2], repeats: u32) -> Option<f64> {
     let bounds = pack.frame_tree(0, frame).bounds();
     let mode = if grid.is_level_set() { Mode::Depth } else { Mode::Density };
     let scene = Scene::new(grid, frame, &View::default(), mode, size);
-    let median = |repeats| {
-        let (_, mut ms) = gpu.trace_timed(&uploaded, [0, frame as u32], bounds, &scene, repeats).ok()?;
-        ms.sort_by(f64::total_cmp);
-        ms.get(ms.len() / 2).copied()
-    };
-    let cold = median(repeats)?;
-    let warm = (WARM_MS / cold.max(0.1)) as u32;
-    if warm > repeats { median(warm) } else { Some(cold) }
+    let place = [0, frame as u32];
+    let timed = steady(repeats, |n| gpu.trace_timed(&uploaded, place, bounds, &scene, n).map(|(_, ms)| ms));
+    timed.ok().map(|timed| timed.median()).filter(|ms| ms.is_finite())
 }
 
 /// A peer's figures, all frames together.

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use serde_json::{Value as Json, json};
 use volpack::codec::{BATCH, BrickRange, Codec, SequenceRange, Texels, encode};
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
-use volpack::settings::{Format, Settings};
+use volpack::settings::{Format, Quality, Settings};
 use volpack::sweep::nanovdb::{self, Quantise};
 use volpack::sweep::{Difference, difference};
 use volpack::vdb::VdbFile;
@@ -28,7 +28,7 @@ pub struct Args {
     #[arg(long, default_value_t = 9)]
     rounds: usize,
     /// The volpack to run
-    #[arg(long, default_value = "target/release/volpack")]
+    #[arg(long, default_value_os_t = peers::volpack())]
     volpack: PathBuf,
     /// The grid
     #[arg(long, default_value = "density")]
@@ -83,7 +83,7 @@ fn builds(args: &Args, files: &[PathBuf], folder: &Path) -> Result<Json, Box<dyn
         (side("nanovdb_convert --fpN", None), convert(&["--fpN", "-a", &tolerance])),
         (side("volpack f16, raw", Some((0, 1.0))), ours(&["--format", "f16", "--zstd", "0"])),
         (side("volpack unorm8, raw", Some((0, 1.0))), ours(&["--format", "unorm8", "--zstd", "0"])),
-        (side("volpack adaptive, 45 dB", Some((1, 6.0))), ours(&[])),
+        (side("volpack adaptive, 45 dB", Some((1, 6.0))), ours(&["--psnr", "45"])),
     ];
     for round in 0..args.rounds {
         for (side, command) in &mut sides {
@@ -135,7 +135,8 @@ type Psnrs = (f64, Vec<Option<f64>>);
 fn our_psnrs(args: &Args, files: &[PathBuf], pack: &Path) -> Result<Psnrs, Box<dyn Error>> {
     let (mut peak, mut psnrs) = (0.0, Vec::new());
     for format in [Format::F16, Format::Unorm8, Format::Adaptive] {
-        let settings = Settings { format, grids: vec![args.grid.clone()], ..Settings::default() };
+        let quality = Quality::Psnr(45.0);
+        let settings = Settings { format, grids: vec![args.grid.clone()], quality, ..Settings::default() };
         let job = Job::new(files.to_vec(), pack.to_owned(), settings, VerifyLevel::Voxels);
         let report = build(&job, &mut Silent)?.verification.ok_or("it was verified")?;
         peak = report.grids[0].peak;

@@ -3,18 +3,22 @@
 use std::error::Error;
 use std::path::PathBuf;
 
+use serde_json::json;
 use volpack::codec::Codec;
 use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::settings::{Clustering, Format, Settings};
 
-use crate::sequence;
+use crate::{peers, sequence};
 
 #[derive(clap::Args)]
 pub struct Args {
     /// Sequences: a file or a glob each
     #[arg(required = true)]
     sequences: Vec<PathBuf>,
+    /// Write the raw figures here too
+    #[arg(long)]
+    json: Option<PathBuf>,
 }
 
 /// k, iterations and variance threshold: the rows of figure 19, and what lies between them.
@@ -32,6 +36,7 @@ const ROWS: [(u32, u32, f64); 9] = [
 
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     let folder = tempfile::tempdir()?;
+    let mut rows = Vec::new();
     println!(
         "| model | k | iterations | variance | before | after | ratio | RMSE | RMSE without | PSNR dB |"
     );
@@ -58,7 +63,9 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 "| {name} | {clusters} | {iterations} | {variance} | {before} | {after} | {:.4} | {rmse:.4} | {alone:.4} | {psnr:.2} |",
                 f64::from(after) / f64::from(before)
             );
+            rows.push(json!({ "volume": name, "k": clusters, "iterations": iterations, "variance": variance,
+                "before": before, "after": after, "rmse": rmse, "rmse_without": alone, "psnr": psnr }));
         }
     }
-    Ok(())
+    peers::write(args.json.as_deref(), &json!(rows))
 }

@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use serde_json::json;
 use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
-use volpack::settings::{Format, Settings};
+use volpack::settings::{Format, Quality, Settings};
 use volpack::vdb::VdbFile;
 
 use crate::measured::median;
@@ -45,7 +45,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     for format in [Format::Adaptive, Format::Bc7, Format::Unorm8, Format::F16] {
         for frames in [short, &long[..]] {
             let path = folder.path().join("bench.volpack");
-            let settings = Settings { format, ..Settings::default() };
+            let settings = Settings { format, quality: Quality::Psnr(45.0), ..Settings::default() };
             build(&Job::new(frames.to_vec(), path.clone(), settings, VerifyLevel::None), &mut Silent)?;
             let pack = Pack::open(&path)?;
             let (file_bytes, gpu_bytes) = (pack.file_bytes() as f64, pack.gpu_bytes() as f64);

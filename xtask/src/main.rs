@@ -13,6 +13,7 @@ mod load;
 mod measured;
 mod mutate;
 mod openvdb;
+mod pages;
 mod peers;
 mod pictures;
 mod read;
@@ -20,6 +21,7 @@ mod scale;
 mod sequence;
 mod size;
 mod stress;
+mod sweep;
 mod trace;
 
 use std::error::Error;
@@ -64,6 +66,8 @@ enum Task {
 
 #[derive(Subcommand)]
 enum Bench {
+    /// Run what the pages of docs/benchmarks and the README are made of, and write it into them
+    All(pages::Args),
     /// Reading time and memory beside OpenVDB's C++ io::File
     Read(read::Args),
     /// Builds with a cache: cold, without a change, after an edit, at another quality, at another level of zstd
@@ -87,10 +91,13 @@ enum Bench {
     Pictures(pictures::Args),
     /// Milliseconds a frame on a GPU: every format, DDA and HDDA, at 1920 × 1080
     Trace(trace::Args),
+    /// The charts of quality against size, build time and trace time, or of stability
+    Sweep(sweep::Args),
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
     match Cli::parse().task {
+        Task::Bench(Bench::All(args)) => pages::bench(&args),
         Task::Bench(Bench::Read(args)) => read::bench(&args),
         Task::Bench(Bench::Cache(args)) => cache::bench(&args),
         Task::Bench(Bench::Scale(args)) => scale::bench(&args),
@@ -102,6 +109,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         Task::Bench(Bench::Size(args)) => size::bench(&args),
         Task::Bench(Bench::Pictures(args)) => pictures::bench(&args),
         Task::Bench(Bench::Trace(args)) => trace::bench(&args),
+        Task::Bench(Bench::Sweep(args)) => sweep::bench(&args),
         Task::Corpus(args) => corpus::run(&args),
         Task::Chart { json, svg } => chart(&json, &svg),
         Task::CheckOpenvdb { files } => openvdb::check(&files),

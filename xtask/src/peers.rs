@@ -44,23 +44,33 @@ pub fn write(path: Option<&Path>, figures: &serde_json::Value) -> Result<(), Box
     path.map_or(Ok(()), |path| Ok(std::fs::write(path, serde_json::to_string(figures)?)?))
 }
 
-/// Compiles `benches/peers/nanovdb_trace.cu` for the GPU that is there, into `target/peers`.
+/// Compiles `benches/peers/nanovdb_trace.cu` for the GPU that is there, into `target/peers`, with the NanoVDB below a folder, or
+/// with the compiler's own. Returns the program and NanoVDB's version.
 ///
 /// # Errors
 /// When there is no CUDA compiler or no NanoVDB: the message says what to install.
-pub fn compile_nanovdb() -> Result<PathBuf, Box<dyn Error>> {
+pub fn compile_nanovdb(headers: Option<&Path>) -> Result<(PathBuf, String), Box<dyn Error>> {
     let folder = root().join("target/peers");
     std::fs::create_dir_all(&folder)?;
-    let program = folder.join("nanovdb_trace");
-    let status = Command::new("nvcc")
-        .args(["-O3", "-std=c++17", "-arch=native"])
-        .arg(root().join("benches/peers/nanovdb_trace.cu"))
-        .arg("-o")
-        .arg(&program)
-        .status();
-    match status {
-        Ok(status) if status.success() => Ok(program),
-        _ => Err("nvcc or NanoVDB is not installed: the CUDA toolkit, and apt-get install libnanovdb-dev libnanovdb-tools"
-            .into()),
+    let fresh = folder.join("nanovdb_trace");
+    let mut compiler = Command::new("nvcc");
+    compiler.args(["-O3", "-std=c++17", "-arch=native", "--extended-lambda"]);
+    if let Some(headers) = headers {
+        compiler.arg("-I").arg(headers);
     }
+    let status = compiler.arg(root().join("benches/peers/nanovdb_trace.cu")).arg("-o").arg(&fresh).status();
+    if !status.is_ok_and(|status| status.success()) {
+        return Err("nvcc or NanoVDB is not installed: the CUDA toolkit, and apt-get install libnanovdb-dev libnanovdb-tools"
+            .into());
+    }
+    // Without arguments it prints its version and no more.
+    let version = String::from_utf8(Command::new(&fresh).output()?.stdout)?.trim().to_owned();
+    let program = folder.join(format!("nanovdb_trace-{version}"));
+    std::fs::rename(&fresh, &program)?;
+    Ok((program, version))
+}
+
+/// The volpack that was built with this.
+pub fn volpack() -> PathBuf {
+    root().join("target/release/volpack")
 }

@@ -3,19 +3,23 @@
 use std::error::Error;
 use std::path::PathBuf;
 
+use serde_json::json;
 use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::render::Device;
 use volpack::settings::{Format, Settings};
 use volpack::verify::{PictureSettings, Sources, pictures};
 
-use crate::sequence;
+use crate::{peers, sequence};
 
 #[derive(clap::Args)]
 pub struct Args {
     /// Sequences: a file or a glob each
     #[arg(required = true)]
     sequences: Vec<PathBuf>,
+    /// Write the raw figures here too
+    #[arg(long)]
+    json: Option<PathBuf>,
     /// What traces the pack
     #[arg(long, default_value = "cpu")]
     device: Device,
@@ -24,6 +28,7 @@ pub struct Args {
 /// Builds every format of each sequence and prints its worst picture.
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     let folder = tempfile::tempdir()?;
+    let mut rows = Vec::new();
     println!("| volume | format | FLIP | PSNR of the picture | RMSE of the picture |");
     println!("|---|---|---|---|---|");
     for sequence in &args.sequences {
@@ -43,7 +48,8 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             let worst = worst.ok_or("no pictures")?.source;
             let psnr = worst.psnr.map_or("same".to_owned(), |db| format!("{db:.1} dB"));
             println!("| {name} | {} | {:.4} | {psnr} | {:.5} |", format.name(), worst.flip, worst.rmse);
+            rows.push(json!({ "volume": name, "format": format, "flip": worst.flip, "psnr": worst.psnr, "rmse": worst.rmse }));
         }
     }
-    Ok(())
+    peers::write(args.json.as_deref(), &json!(rows))
 }

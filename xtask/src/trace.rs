@@ -2,17 +2,18 @@
 //! rays.
 
 use std::error::Error;
-use std::io::Write;
+use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
+use std::process::{Child, ChildStdout, Command, Stdio};
 
-use serde_json::json;
+use serde_json::{Value as Json, json};
 use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::render::gpu::Gpu;
 use volpack::render::{Image, Interpolation, Lens, Mode, Scene, Traversal, View};
 use volpack::settings::{Format, Settings};
 use volpack::sweep::nanovdb::{self, Quantise};
+use volpack::sweep::{Steady, steady};
 
 use crate::beside::TOLERANCE;
 use crate::measured::median;
@@ -23,15 +24,15 @@ pub struct Args {
     /// OpenVDB files
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// Times each picture is traced; the median counts
+    /// Times each picture is traced at least; the median counts, once three in a row agree
     #[arg(long, default_value_t = 100)]
     repeats: u32,
     /// Pixels, as WIDTH HEIGHT
     #[arg(long, num_args = 2, default_values_t = [1920, 1080])]
     size: Vec<u32>,
-    /// benches/peers/nanovdb_trace.cu, compiled; without it nvcc is asked to
-    #[arg(long)]
-    peer: Option<PathBuf>,
+    /// A folder that holds nanovdb/, to trace with that one beside; again for another [default: the compiler's own]
+    #[arg(long, value_name = "DIR")]
+    nanovdb: Vec<PathBuf>,
     /// Write the raw figures here too
     #[arg(long)]
     json: Option<PathBuf>,
@@ -39,8 +40,6 @@ pub struct Args {
 
 /// Along (-0.6, -0.35, -0.72) from one diagonal away.
 const VIEW: View = View::Orbit([39.8056, 20.4927, 1.0]);
-/// Pictures before those that count, while clocks rise.
-const WARM_UP: u32 = 10;
 
 /// What is shown of a level set or of fog: its name, which is the peer's word too, and how.
 type Shown = (&'static str, Mode, Interpolation);
@@ -50,120 +49,188 @@ const LEVEL_SET: &[Shown] =
 
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     let gpu = Gpu::shared()?;
+    if gpu.is_software {
+        return Err(format!("{} is no GPU: its times say nothing of one", gpu.name).into());
+    }
     let folder = tempfile::tempdir()?;
     let [width, height] = args.size[..] else { return Err("a size is WIDTH HEIGHT".into()) };
-    let size = [width, height];
-    let peer = args.peer.clone().map_or_else(peers::compile_nanovdb, Ok);
-    if let Err(reason) = &peer {
+    let peers = peers(args);
+    if let Err(reason) = &peers {
         println!("NanoVDB is left out: {reason}\n");
     }
-    let mut rows = Vec::new();
-    println!("{} at {width} × {height}, median of {} frames\n", gpu.name, args.repeats);
-    println!(
-        "| volume | shows | format | HDDA ms | NanoVDB float ms | HDDA / float | FpN ms | HDDA / FpN | apart | DDA ms | DDA / HDDA | HDDA steps | DDA steps |"
-    );
-    println!("|---|---|---|---|---|---|---|---|---|---|---|---|---|");
+    let peers = peers.unwrap_or_default();
+    println!("{} at {width} × {height}, medians of {} frames or more\n", gpu.name, args.repeats);
+    print_head(&peers);
+    let mut bench =
+        Bench { args, gpu, size: [width, height], peers, folder: folder.path(), rows: Vec::new() };
     for path in &args.files {
-        let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        let mut theirs: Vec<(&str, &str, Theirs)> = Vec::new();
-        let mut lines = Vec::new();
-        for format in Format::ALL {
-            let job = Job::new(
-                vec![path.clone()],
-                folder.path().join("bench.volpack"),
-                Settings { format, ..Settings::default() },
-                VerifyLevel::None,
-            );
-            build(&job, &mut Silent)?;
-            let pack = Pack::open(&job.output)?;
-            let uploaded = gpu.upload(&pack)?;
-            let bounds = pack.frame_tree(0, 0).bounds();
-            let grid = &pack.grids[0];
-            for &(shows, mode, interpolation) in if grid.is_level_set() { LEVEL_SET } else { FOG } {
-                let scene = Scene { interpolation, ..Scene::new(grid, 0, &VIEW, mode, size) };
-                if let (Format::F32, Ok(peer)) = (format, &peer) {
-                    // What the converter itself allows: a tenth of a voxel where there is a level set.
-                    let absolute = if scene.level_set {
-                        0.1 * volpack::vdb::voxel_size(&scene.matrix)
-                    } else {
-                        TOLERANCE
-                    };
-                    for (kind, quantise) in [(FLOAT, Quantise::Float), (FPN, Quantise::FpN { absolute })] {
-                        let source = (path.as_path(), grid.name.as_str(), quantise);
-                        let traced = nanovdb_trace(peer, source, shows, &scene, args.repeats, folder.path())?;
-                        theirs.push((shows, kind, traced));
-                    }
-                }
-                let theirs = |kind| {
-                    theirs.iter().find(|their| (their.0, their.1) == (shows, kind)).map(|their| &their.2)
-                };
-                let mut row = Vec::new();
-                let mut apart = None;
-                for traversal in [Traversal::Hdda, Traversal::Dda] {
-                    let scene = Scene { traversal, ..scene };
-                    let repeats = args.repeats + WARM_UP;
-                    let (image, ms) = gpu.trace_timed(&uploaded, [0, 0], bounds, &scene, repeats)?;
-                    apart = apart.or_else(|| theirs(FLOAT).map(|t| t.apart(&image, &scene)));
-                    let ms = ms.get(WARM_UP as usize..).unwrap_or_default();
-                    row.push((median(ms.iter().copied()), image.mean_steps()));
-                    rows.push(json!({ "volume": name, "shows": shows, "format": format,
-                        "traversal": format!("{traversal:?}"), "milliseconds": ms,
-                        "mean_steps": image.mean_steps() }));
-                }
-                let [(hdda, hdda_steps), (dda, dda_steps)] = row[..] else {
-                    return Err("two traversals".into());
-                };
-                let beside = match (theirs(FLOAT), theirs(FPN), apart) {
-                    (Some(float), Some(fpn), Some(apart)) => {
-                        let [float, fpn] = [float, fpn].map(|t| median(t.milliseconds.iter().copied()));
-                        let [of_float, of_fpn] = [hdda / float, hdda / fpn];
-                        format!("{float:.3} | {of_float:.2} | {fpn:.3} | {of_fpn:.2} | {apart:.1e}")
-                    }
-                    _ => " | | | | ".to_owned(),
-                };
-                lines.push((shows, format!(
-                    "| {name} | {shows} | {} | {hdda:.3} | {beside} | {dda:.3} | {:.2} | {hdda_steps:.1} | {dda_steps:.1} |",
-                    format.name(),
-                    dda / hdda
-                )));
-            }
-        }
-        lines.sort_by_key(|(shows, _)| std::cmp::Reverse(*shows));
-        lines.iter().for_each(|(_, line)| println!("{line}"));
-        rows.extend(theirs.iter().map(|(shows, kind, theirs)| {
-            json!({ "volume": name, "shows": shows, "format": kind, "milliseconds": theirs.milliseconds })
-        }));
+        bench.volume(path)?;
     }
-    if let Some(path) = &args.json {
-        std::fs::write(path, serde_json::to_string(&json!({ "device": gpu.name, "rows": rows }))?)?;
-    }
-    Ok(())
+    peers::write(args.json.as_deref(), &json!({ "device": gpu.name, "rows": bench.rows }))
 }
 
-/// NanoVDB's grids.
-const FLOAT: &str = "NanoVDB float";
-const FPN: &str = "NanoVDB FpN";
+/// A compiled tracer of NanoVDB's.
+struct Peer {
+    program: PathBuf,
+    version: String,
+}
 
-/// What NanoVDB makes of a scene.
+fn peers(args: &Args) -> Result<Vec<Peer>, Box<dyn Error>> {
+    let compile = |headers| peers::compile_nanovdb(headers).map(|(program, version)| Peer { program, version });
+    if args.nanovdb.is_empty() {
+        return Ok(vec![compile(None)?]);
+    }
+    args.nanovdb.iter().map(|headers| compile(Some(headers))).collect()
+}
+
+fn print_head(peers: &[Peer]) {
+    let mut head = "| volume | shows | format | HDDA ms |".to_owned();
+    for Peer { version, .. } in peers {
+        head += &format!(" NanoVDB {version}, float, ms | HDDA / it | its FpN ms | HDDA / it |");
+    }
+    head += if peers.is_empty() { "" } else { " apart |" };
+    head += " DDA ms | DDA / HDDA | HDDA steps | DDA steps |";
+    println!("{head}\n{}|", "|---".repeat(head.matches('|').count() - 1));
+}
+
+struct Bench<'a> {
+    args: &'a Args,
+    gpu: &'static Gpu,
+    size: [u32; 2],
+    peers: Vec<Peer>,
+    folder: &'a Path,
+    rows: Vec<Json>,
+}
+
+impl Bench<'_> {
+    fn volume(&mut self, path: &Path) -> Result<(), Box<dyn Error>> {
+        let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        let mut packs = Vec::new();
+        for format in Format::ALL {
+            let output = self.folder.join(format!("{}.volpack", format.name()));
+            let settings = Settings { format, ..Settings::default() };
+            build(&Job::new(vec![path.to_owned()], output.clone(), settings, VerifyLevel::None), &mut Silent)?;
+            packs.push((format, Pack::open(&output)?));
+        }
+        let grid = &packs[0].1.grids[0];
+        for &(shows, mode, interpolation) in if grid.is_level_set() { LEVEL_SET } else { FOG } {
+            let scene = Scene { interpolation, ..Scene::new(grid, 0, &VIEW, mode, self.size) };
+            let theirs = self.theirs(path, &grid.name, shows, &scene)?;
+            for (format, pack) in &packs {
+                self.row((&name, shows, *format), pack, &scene, &theirs)?;
+            }
+            for (version, kind, traced) in theirs.iter().flat_map(Theirs::kinds) {
+                self.rows.push(json!({ "volume": name, "shows": shows, "format": kind, "nanovdb": version,
+                    "milliseconds": traced.timed.milliseconds, "is_steady": traced.timed.is_steady }));
+            }
+        }
+        Ok(())
+    }
+
+    /// What each peer makes of a scene.
+    fn theirs(
+        &self,
+        vdb: &Path,
+        grid: &str,
+        shows: &str,
+        scene: &Scene,
+    ) -> Result<Vec<Theirs>, Box<dyn Error>> {
+        // What the converter itself allows: a tenth of a voxel where there is a level set.
+        let absolute =
+            if scene.level_set { 0.1 * volpack::vdb::voxel_size(&scene.matrix) } else { TOLERANCE };
+        let mut all = Vec::new();
+        for Peer { program, version } in &self.peers {
+            let trace = |quantise| {
+                let nvdb = self.folder.join("peer.nvdb");
+                nanovdb::convert(vdb, grid, &quantise, &nvdb)?;
+                nanovdb_trace(program, &nvdb, shows, scene, self.args.repeats)
+            };
+            let (float, fpn) = (trace(Quantise::Float)?, trace(Quantise::FpN { absolute })?);
+            all.push(Theirs { version: version.clone(), float, fpn });
+        }
+        Ok(all)
+    }
+
+    /// Traces a pack both ways and prints its row.
+    fn row(
+        &mut self,
+        (name, shows, format): (&str, &str, Format),
+        pack: &Pack,
+        scene: &Scene,
+        theirs: &[Theirs],
+    ) -> Result<(), Box<dyn Error>> {
+        let uploaded = self.gpu.upload(pack)?;
+        let bounds = pack.frame_tree(0, 0).bounds();
+        let mut trace = |traversal| -> Result<(Steady, Image), Box<dyn Error>> {
+            let scene = Scene { traversal, ..*scene };
+            let mut image = None;
+            let timed = steady(self.args.repeats, |frames| -> Result<_, Box<dyn Error>> {
+                let (last, ms) = self.gpu.trace_timed(&uploaded, [0, 0], bounds, &scene, frames)?;
+                image = Some(last);
+                Ok(ms)
+            })?;
+            let image = image.ok_or("no picture")?;
+            self.rows.push(json!({ "volume": name, "shows": shows, "format": format,
+                "traversal": format!("{traversal:?}"), "milliseconds": timed.milliseconds, "is_steady": timed.is_steady,
+                "mean_steps": image.mean_steps() }));
+            Ok((timed, image))
+        };
+        let (hdda, picture) = trace(Traversal::Hdda)?;
+        let (dda, dda_picture) = trace(Traversal::Dda)?;
+        let mut line = format!("| {name} | {shows} | {} | {} |", format.name(), ms(&hdda));
+        for (_, _, traced) in theirs.iter().flat_map(Theirs::kinds) {
+            line += &format!(" {} | {:.2} |", ms(&traced.timed), hdda.median() / traced.timed.median());
+        }
+        if let Some(theirs) = theirs.first() {
+            line += &format!(" {:.1e} |", theirs.float.apart(&picture, scene));
+        }
+        println!(
+            "{line} {} | {:.2} | {:.1} | {:.1} |",
+            ms(&dda),
+            dda.median() / hdda.median(),
+            picture.mean_steps(),
+            dda_picture.mean_steps()
+        );
+        Ok(())
+    }
+}
+
+/// The median; with a mark where it never came to rest.
+fn ms(timed: &Steady) -> String {
+    format!("{:.3}{}", timed.median(), if timed.is_steady { "" } else { " (unsteady)" })
+}
+
+/// What one of NanoVDB's versions makes of a scene.
 struct Theirs {
-    milliseconds: Vec<f64>,
+    version: String,
+    float: Traced,
+    fpn: Traced,
+}
+
+impl Theirs {
+    /// Its version, and its grids by name.
+    fn kinds(&self) -> [(&str, &'static str, &Traced); 2] {
+        [(&self.version, "NanoVDB float", &self.float), (&self.version, "NanoVDB FpN", &self.fpn)]
+    }
+}
+
+struct Traced {
+    timed: Steady,
     /// World units of a voxel.
     voxel: f64,
     /// In voxels: the integral of density, or depth.
     picture: Vec<f32>,
 }
 
-/// Traces a grid of a file, quantised, with the peer's program.
+/// Traces a grid with the peer's program.
 fn nanovdb_trace(
-    peer: &Path,
-    (vdb, grid, quantise): (&Path, &str, Quantise),
+    program: &Path,
+    nvdb: &Path,
     shows: &str,
     scene: &Scene,
     repeats: u32,
-    folder: &Path,
-) -> Result<Theirs, Box<dyn Error>> {
-    let (nvdb, out) = (folder.join("peer.nvdb"), folder.join("peer.f32"));
-    nanovdb::convert(vdb, grid, &quantise, &nvdb)?;
+) -> Result<Traced, Box<dyn Error>> {
+    let picture = nvdb.with_extension("f32");
     // To NanoVDB's steps a voxel is the cube from its coordinate on, half a voxel off from index space; between
     // voxels a cell is.
     let shift = if shows == "trilinear" { 0.0 } else { 0.5 };
@@ -171,32 +238,44 @@ fn nanovdb_trace(
         Lens::new(&scene.camera, &scene.matrix, scene.size, [shift; 3]).ok_or("no inverse transform")?;
     let rays = [lens.origin, lens.forward, lens.right, lens.up].concat();
     let rays: Vec<String> = rays.iter().map(ToString::to_string).collect();
-    let mut child = Command::new(peer)
-        .arg(&nvdb)
+    let mut child = Command::new(program)
+        .arg(nvdb)
         .arg(shows)
         .args(scene.size.map(|s| s.to_string()))
-        .arg((repeats + WARM_UP).to_string())
-        .arg(&out)
+        .arg(&picture)
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())
         .spawn()?;
-    child.stdin.take().ok_or("a pipe")?.write_all(rays.join(" ").as_bytes())?;
-    let output = child.wait_with_output()?;
-    if !output.status.success() {
-        return Err(format!("{} failed on {}", peer.display(), vdb.display()).into());
-    }
-    let milliseconds = String::from_utf8(output.stdout)?
-        .lines()
-        .skip(WARM_UP as usize)
-        .map(str::parse)
-        .collect::<Result<_, _>>()?;
+    let mut input = child.stdin.take().ok_or("a pipe")?;
+    let mut output = BufReader::new(child.stdout.take().ok_or("a pipe")?);
+    writeln!(input, "{}", rays.join(" "))?;
+    let timed = steady(repeats, |frames| -> Result<_, Box<dyn Error>> {
+        writeln!(input, "{frames}")?;
+        input.flush()?;
+        (0..frames).map(|_| line(&mut output)).collect()
+    });
+    drop(input);
+    wait(child, program, nvdb)?;
     let [x, y, z] = lens.forward;
-    let picture = std::fs::read(&out)?;
+    let picture = std::fs::read(&picture)?;
     let picture = picture.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
-    Ok(Theirs { milliseconds, voxel: 1.0 / (x * x + y * y + z * z).sqrt(), picture })
+    Ok(Traced { timed: timed?, voxel: 1.0 / (x * x + y * y + z * z).sqrt(), picture })
 }
 
-impl Theirs {
+fn line(output: &mut BufReader<ChildStdout>) -> Result<f64, Box<dyn Error>> {
+    let mut line = String::new();
+    output.read_line(&mut line)?;
+    Ok(line.trim().parse()?)
+}
+
+fn wait(mut child: Child, program: &Path, nvdb: &Path) -> Result<(), Box<dyn Error>> {
+    if child.wait()?.success() {
+        return Ok(());
+    }
+    Err(format!("{} failed on {}", program.display(), nvdb.display()).into())
+}
+
+impl Traced {
     /// How far the pictures are apart. Fog: the mean difference of opacity. Level sets: the median difference
     /// in voxels where both hit.
     fn apart(&self, ours: &Image, scene: &Scene) -> f64 {

@@ -1,0 +1,64 @@
+//! The charts of quality against cost: `volpack sweep`, where the pages keep them.
+
+use std::error::Error;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use crate::peers;
+use crate::sequence;
+
+#[derive(clap::Args)]
+pub struct Args {
+    /// Sequences: a file or a glob each
+    #[arg(required = true)]
+    sequences: Vec<PathBuf>,
+    /// How steady each method is, instead of what it costs
+    #[arg(long)]
+    stability: bool,
+    /// How often builds and pictures are timed
+    #[arg(long, default_value_t = 5)]
+    repeats: u32,
+    /// Pixels of the pictures, as WIDTH HEIGHT
+    #[arg(long, num_args = 2, default_values_t = [1920, 1080])]
+    size: Vec<u32>,
+    /// Threads of a build; two are what a small CI machine has
+    #[arg(long, default_value_t = 2)]
+    threads: usize,
+    /// The volpack to run
+    #[arg(long, default_value_os_t = peers::volpack())]
+    volpack: PathBuf,
+    /// Draw the charts below this folder, in charts/ and runs/
+    #[arg(long, default_value_os_t = peers::root().join("docs/benchmarks"))]
+    output: PathBuf,
+}
+
+/// Sweeps each sequence; prints the charts as a page shows them.
+pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
+    let kind = if args.stability { "stability" } else { "sweep" };
+    for sequence in &args.sequences {
+        let (name, frames) = sequence::named(sequence)?;
+        let folder = tempfile::tempdir()?;
+        let mut command = Command::new(&args.volpack);
+        command.args(["sweep", "--quiet"]).args(&frames).arg("-o").arg(folder.path());
+        if args.stability {
+            command.arg("--stability");
+        } else {
+            command.args(["--repeats", &args.repeats.to_string(), "--threads", &args.threads.to_string(), "--trace"]);
+            command.args(args.size.iter().map(ToString::to_string));
+        }
+        let status = command.status()?;
+        if !status.success() {
+            return Err(format!("{command:?}: {status}").into());
+        }
+        let keep = |from: &str, to: &Path| -> Result<(), Box<dyn Error>> {
+            std::fs::create_dir_all(to.parent().ok_or("a folder")?)?;
+            std::fs::copy(folder.path().join(from), to)?;
+            Ok(())
+        };
+        let chart = format!("charts/{kind}-{name}.svg");
+        keep(&format!("{kind}.svg"), &args.output.join(&chart))?;
+        keep(&format!("{kind}.json"), &args.output.join(format!("runs/{kind}-{name}.json")))?;
+        println!("![{name}]({chart})");
+    }
+    Ok(())
+}
