@@ -15,9 +15,9 @@ use crate::verify::VerifyReport;
 const PACK: Stage = Stage { name: "pack", version: 1, travels: true };
 /// A pack whose level of zstd is not what was asked for, but all else is.
 const ANY_LEVEL: Stage = Stage { name: "pack-any-zstd", version: 1, travels: true };
-const VERIFY: Stage = Stage { name: "verify", version: 3, travels: true };
+const VERIFY: Stage = Stage { name: "verify", version: 4, travels: true };
 /// A verification whose pictures were traced by the CPU alone, since no device could.
-const VERIFY_ON_CPU: Stage = Stage { name: "verify-on-cpu", version: 1, travels: true };
+const VERIFY_ON_CPU: Stage = Stage { name: "verify-on-cpu", version: 2, travels: true };
 
 /// What the cache may have for a job.
 pub(super) struct Reuse<'a> {

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use super::camera::{Camera, Lens, View, WorldBox, apply3, dot, invert3, length, normalise};
 use super::field::{Content, Field};
-use super::image::{Image, opacity};
+use super::image::{Image, apart, opacity};
 use super::surface::{cubic, evaluate, first_change};
 use super::traverse::{Box3, MAX_CELL, Ray, Real, Walk};
 use super::{Interpolation, Mode, Traversal};
@@ -154,11 +154,31 @@ pub fn trace<F: Real>(field: &Field, scene: &Scene) -> Result<Image, TraceError>
 /// [`TraceError`].
 pub fn trace_noting_bc4<F: Real>(field: &Field, scene: &Scene) -> Result<(Image, Vec<bool>), TraceError> {
     let setup = Setup::new(scene, field.bounds)?;
-    let tracer = Tracer::<F> { field, scene, setup: &setup, extinction: F::from_f64(scene.extinction) };
+    let tracer = Tracer::<F>::new(field, scene, &setup);
     let [width, height] = scene.size;
     let pixels = (0..width * height).into_par_iter().map(|i| tracer.pixel(i % width, i / width));
     let (pixels, reads_bc4) = pixels.unzip();
     Ok((Image { size: scene.size, pixels }, reads_bc4))
+}
+
+/// How far arithmetic decides what these pixels (y · width + x) are: the most by which one changes where its ray and the
+/// values around it are moved by a few roundings, and values by their brick's uncertainty, in sixteen ways. Where a surface
+/// lies beside huge values, or a ray meets an edge, no two GPUs agree by more.
+///
+/// # Errors
+/// [`TraceError`].
+pub fn spread(field: &Field, scene: &Scene, pixels: &[usize]) -> Result<Vec<f32>, TraceError> {
+    let setup = Setup::new(scene, field.bounds)?;
+    let tracer = Tracer::<f32>::new(field, scene, &setup);
+    let width = scene.size[0] as usize;
+    let spread = |&pixel: &usize| {
+        let [x, y] = [pixel % width, pixel / width].map(|v| v as u32);
+        let (still, _) = tracer.pixel(x, y);
+        let moved = (0..WAYS).map(|way| Tracer { way: Some(way), ..tracer }.pixel(x, y).0);
+        // Numbers are no further than 2 apart; what is none is no number on any GPU.
+        moved.map(|moved| apart(&still[..3], &moved[..3])).fold(0.0, f32::max).min(2.0)
+    };
+    Ok(pixels.par_iter().map(spread).collect())
 }
 
 /// For each pixel the integral of density over distance, which [`Mode::Density`] shows as opacity.
@@ -167,7 +187,7 @@ pub fn trace_noting_bc4<F: Real>(field: &Field, scene: &Scene) -> Result<(Image,
 /// [`TraceError`].
 pub fn optical_depths<F: Real>(field: &Field, scene: &Scene) -> Result<Vec<f32>, TraceError> {
     let setup = Setup::new(scene, field.bounds)?;
-    let tracer = Tracer::<F> { field, scene, setup: &setup, extinction: F::from_i32(1) };
+    let tracer = Tracer::<F> { extinction: F::from_i32(1), ..Tracer::new(field, scene, &setup) };
     let [width, height] = scene.size;
     let depth = |i| {
         let ray = tracer.ray(i % width, i / width);
@@ -183,12 +203,19 @@ struct Visited {
     reads_bc4: bool,
 }
 
+#[derive(Clone, Copy)]
 struct Tracer<'a, F> {
     field: &'a Field,
     scene: &'a Scene,
     setup: &'a Setup,
     extinction: F,
+    /// In which of [`WAYS`] rays and values are moved: a bit for each axis, and one for the sign of [`pattern`].
+    way: Option<u32>,
 }
+
+/// How many roundings a ray is moved by, of its farthest coordinate (two for its origin, one for how far along it a place
+/// is, one for what is counted from there), and a cell's corners, of the largest (in sums of four and eight of them).
+const ROUNDINGS: f32 = 4.0 * f32::EPSILON;
 
 /// Where a ray first hits something.
 struct Hit<F> {
@@ -201,11 +228,20 @@ struct Hit<F> {
     value: f32,
 }
 
-impl<F: Real> Tracer<'_, F> {
+impl<'a, F: Real> Tracer<'a, F> {
+    fn new(field: &'a Field, scene: &'a Scene, setup: &'a Setup) -> Self {
+        Self { field, scene, setup, extinction: F::from_f64(scene.extinction), way: None }
+    }
+
     fn ray(&self, x: u32, y: u32) -> Ray<F> {
         let [width, height] = self.scene.size;
         let at = |i: u32, n: u32| (2.0 * f64::from(i) + 1.0) / f64::from(n) - 1.0;
-        self.setup.lens.ray(at(x, width), -at(y, height))
+        let ray: Ray<F> = self.setup.lens.ray(at(x, width), -at(y, height));
+        let Some(way) = self.way else { return ray };
+        let farthest = ray.origin.iter().map(|v| v.to_f64().abs()).fold(1.0, f64::max);
+        let by = F::from_f64(farthest * f64::from(ROUNDINGS));
+        let origin = std::array::from_fn(|a| ray.origin[a] + if way >> a & 1 == 1 { by } else { -by });
+        Ray::new(origin, ray.direction)
     }
 
     fn pixel(&self, x: u32, y: u32) -> ([f32; 4], bool) {
@@ -241,8 +277,9 @@ impl<F: Real> Tracer<'_, F> {
         let (constant, value) = match found.content {
             Content::Constant(constant) => (true, constant.value),
             Content::Brick(brick) => {
-                visited.reads_bc4 |= brick.is_bc4;
-                (false, brick.values[voxel.child_index(3, 1)])
+                visited.reads_bc4 |= brick.uncertainty > 0.0;
+                let value = brick.values[voxel.child_index(3, 1)];
+                (false, value + self.way.map_or(0.0, |way| brick.uncertainty * pattern(way, voxel)))
             }
         };
         if constant && self.skips() {
@@ -345,7 +382,7 @@ impl<F: Real> Tracer<'_, F> {
             let (exit, _) = walk.exit(ray, cell);
             let from = self.local(ray, walk.cell, walk.t);
             let along = std::array::from_fn(|a| ray.direction[a] * (exit - walk.t));
-            let c = cubic(corners, from, along);
+            let c = cubic(self.moved(corners, walk.cell), from, along);
             let start = *negative.get_or_insert(evaluate(c, F::from_i32(0)) < F::from_i32(0));
             if is_mixed(start)
                 && let Some(u) = first_change(c, start)
@@ -371,8 +408,18 @@ impl<F: Real> Tracer<'_, F> {
         })
     }
 
+    /// A cell's corners, moved by what is rounded where sums of them are.
+    fn moved(&self, corners: [F; 8], cell: [i32; 3]) -> [F; 8] {
+        let Some(way) = self.way else { return corners };
+        let largest = corners.iter().map(|v| v.to_f64().abs()).fold(0.0, f64::max);
+        std::array::from_fn(|i| {
+            let corner = Coord(std::array::from_fn(|a| cell[a] + (i >> a & 1) as i32));
+            corners[i] + F::from_f64(largest * f64::from(ROUNDINGS * pattern(way, corner)))
+        })
+    }
+
     fn surface_hit(&self, ray: &Ray<F>, walk: &Walk<F>, t: F, visited: &mut Visited) -> Hit<F> {
-        let c = self.corners(walk.cell, visited).map(Real::to_f64);
+        let c = self.moved(self.corners(walk.cell, visited), walk.cell).map(Real::to_f64);
         let p = self.local(ray, walk.cell, t).map(|v| v.to_f64().clamp(0.0, 1.0));
         let gradient: [f64; 3] = std::array::from_fn(|a| {
             (0..8)
@@ -450,6 +497,15 @@ impl<F: Real> Tracer<'_, F> {
 /// Side, half width of the line in cells, and colour of what is drawn around nodes.
 const NODE_COLORS: [(i32, f64, [f32; 3]); 3] =
     [(ROOT_DIM, 1.0, [0.1, 0.2, 1.0]), (128, 0.75, [1.0, 0.15, 0.1]), (8, 0.5, [0.0, 0.9, 0.9])];
+
+const WAYS: u32 = 16;
+
+/// 1 or -1, changing along the axes of `way`: by these patterns the corners of a cell are moved in all ways that change
+/// where its zero is or how steep it is.
+fn pattern(way: u32, voxel: Coord) -> f32 {
+    let odd = (0..3).filter(|&a| way >> a & 1 == 1 && voxel.0[a] & 1 == 1).count();
+    if (odd % 2 == 1) != (way >> 3 == 1) { -1.0 } else { 1.0 }
+}
 
 /// A hue that differs between neighbouring bricks: the same bits in the shader.
 fn brick_hue(cell: [i32; 3]) -> [f32; 3] {

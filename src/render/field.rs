@@ -23,14 +23,23 @@ pub struct Field {
 pub struct FieldBrick {
     /// Their values, x slowest.
     pub values: Box<[f32; BRICK_VOXELS]>,
-    /// Whether they are interpolated between the endpoints of BC4 blocks, which each GPU does in its own way.
-    pub is_bc4: bool,
+    /// How far a GPU's values may be from these: 0 but for BC4, whose blocks each GPU interpolates in its own way.
+    pub uncertainty: f32,
 }
 
 enum Cell {
     Constant(Constant),
     /// For each of 4096 places what is there; 0 is background.
     Node(Box<[u32; 4096]>, Vec<Constant>),
+}
+
+/// How far apart GPUs interpolate, of the distance of a block's endpoints.
+const BC4_UNCERTAINTY: f32 = 0.03;
+
+fn span(values: &[f32]) -> f32 {
+    let least = values.iter().copied().fold(f32::INFINITY, f32::min);
+    let most = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    most - least
 }
 
 /// Marks a place's number as that of a constant.
@@ -86,7 +95,7 @@ impl Field {
                                 let brick = bricks[i as usize].take().expect("each brick is named once");
                                 field.put_brick(
                                     origin,
-                                    FieldBrick { values: Box::new(brick.values), is_bc4: false },
+                                    FieldBrick { values: Box::new(brick.values), uncertainty: 0.0 },
                                 );
                             }
                         }
@@ -115,7 +124,8 @@ impl Field {
             Region::Brick(record) => match frame.decode(&record) {
                 Ok(brick) => {
                     let is_bc4 = record.codec == Codec::Bc4;
-                    field.put_brick(origin, FieldBrick { values: brick.values, is_bc4 });
+                    let uncertainty = if is_bc4 { BC4_UNCERTAINTY * span(&brick.values[..]) } else { 0.0 };
+                    field.put_brick(origin, FieldBrick { values: brick.values, uncertainty });
                 }
                 Err(e) => result = Err(e),
             },

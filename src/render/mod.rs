@@ -19,7 +19,7 @@ mod surface;
 mod traverse;
 
 pub use camera::{Camera, CameraError, Lens, View, WorldBox};
-pub use cpu::{Scene, TraceError, optical_depths, trace, trace_noting_bc4};
+pub use cpu::{Scene, TraceError, optical_depths, spread, trace, trace_noting_bc4};
 pub use field::Field;
 pub use image::{Difference, Image, apart, difference, write_apng, write_png};
 pub use renderer::{Device, Renderer};

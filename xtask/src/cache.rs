@@ -68,7 +68,13 @@ fn cases() -> Vec<Case> {
         case("one frame edited", PLAIN, Frames::Edited, after, Some(1.0 / 8.0)),
         case("45 to 46 dB", &["--psnr", "46", "--verify", "none"], Frames::Source, after, Some(1.0 / 3.0)),
         case("45 to 52 dB", &["--psnr", "52", "--verify", "none"], Frames::Source, after, Some(1.0 / 3.0)),
-        case("zstd 3 to 9", &["--psnr", "45", "--verify", "none", "--zstd", "9"], Frames::Source, after, Some(1.0 / 5.0)),
+        case(
+            "zstd 3 to 9",
+            &["--psnr", "45", "--verify", "none", "--zstd", "9"],
+            Frames::Source,
+            after,
+            Some(1.0 / 5.0),
+        ),
         case("cold, verified", VERIFIED, Frames::Source, Start::Empty, None),
         case("no change, verified", VERIFIED, Frames::Source, Start::After(VERIFIED), Some(1.0 / 50.0)),
     ]

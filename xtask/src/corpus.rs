@@ -217,6 +217,7 @@ fn reason(job: &Job, grid: &Grid, why: &str) -> Option<&'static str> {
     let format = job.settings.format;
     let is_uniform = format.codec().is_some();
     let is_blocks = matches!(format, Format::Bc4 | Format::Bc7);
+    let is_bytes = is_blocks || format == Format::Unorm8;
     let asks_for_bytes = job.settings.quality.is_size() && !is_uniform;
     let list = [
         (
@@ -228,8 +229,8 @@ fn reason(job: &Job, grid: &Grid, why: &str) -> Option<&'static str> {
             "so few bytes leave next to nothing",
         ),
         (
-            is_blocks && grid.class == GridClass::LevelSet && why.contains("flipped"),
-            "uniform blocks on a level set",
+            is_bytes && grid.class == GridClass::LevelSet && why.contains("flipped"),
+            "a byte or less for each voxel of a level set, the same for all bricks",
         ),
         (is_blocks && why.contains("is under 20 dB"), "uniform blocks on steep values"),
         (is_uniform && grid.is_integer && why.contains("integer"), "one codec that does not keep integers"),

@@ -85,7 +85,9 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
 
 fn ways() -> Vec<Way> {
     let mut ways = Vec::new();
-    for (name, quality) in [("adaptive (default)", Quality::default()), ("adaptive, 45 dB", Quality::Psnr(45.0))] {
+    for (name, quality) in
+        [("adaptive (default)", Quality::default()), ("adaptive, 45 dB", Quality::Psnr(45.0))]
+    {
         let settings = Settings { quality, ..Settings::default() };
         ways.push(Way { name: name.to_owned(), range: None, settings });
     }
@@ -94,7 +96,11 @@ fn ways() -> Vec<Way> {
         for range in [RangeMode::Brick, RangeMode::Sequence] {
             if is_normalised || range == RangeMode::Brick {
                 let settings = Settings { format, range, ..Settings::default() };
-                ways.push(Way { name: format.name().to_owned(), range: is_normalised.then_some(range), settings });
+                ways.push(Way {
+                    name: format.name().to_owned(),
+                    range: is_normalised.then_some(range),
+                    settings,
+                });
             }
         }
     }

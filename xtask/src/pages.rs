@@ -96,7 +96,8 @@ fn run(args: &Args, words: &str, commit: &str) -> Result<String, Box<dyn Error>>
     let printed = String::from_utf8(output.stdout)?;
     let date = Command::new("date").args(["-u", "+%Y-%m-%d"]).output()?.stdout;
     let (date, machine) = (String::from_utf8(date)?.trim().to_owned(), machine()?);
-    let shown = words.split(' ').map(|word| if word.contains('*') { format!("'{word}'") } else { word.to_owned() });
+    let shown =
+        words.split(' ').map(|word| if word.contains('*') { format!("'{word}'") } else { word.to_owned() });
     let shown = shown.collect::<Vec<_>>().join(" ");
     let words = wrap(&format!("target/release/xtask bench {shown}"));
     Ok(format!("\n{date}, commit {commit}, {machine}:\n\n{words}\n\n{}\n", printed.trim()))
@@ -127,14 +128,16 @@ fn commit() -> Result<String, Box<dyn Error>> {
         Ok(String::from_utf8(output.stdout)?.trim().to_owned())
     };
     let commit = git(&["rev-parse", "--short=10", "HEAD"])?;
-    let changed = git(&["status", "--porcelain", "--", "src", "crates", "xtask", "benches", "shaders", "Cargo.lock"])?;
+    let changed =
+        git(&["status", "--porcelain", "--", "src", "crates", "xtask", "benches", "shaders", "Cargo.lock"])?;
     Ok(if changed.is_empty() { commit } else { format!("{commit} with changes") })
 }
 
 /// The processor and how much of it there is.
 fn machine() -> Result<String, Box<dyn Error>> {
     let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let model = info.lines().find_map(|line| line.strip_prefix("model name")).unwrap_or(": an unknown processor");
+    let model =
+        info.lines().find_map(|line| line.strip_prefix("model name")).unwrap_or(": an unknown processor");
     let model = Path::new(model.trim_start_matches([' ', '\t', ':'])).display().to_string();
     Ok(format!("{} threads of {model}", std::thread::available_parallelism()?))
 }

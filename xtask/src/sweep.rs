@@ -43,7 +43,13 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
         if args.stability {
             command.arg("--stability");
         } else {
-            command.args(["--repeats", &args.repeats.to_string(), "--threads", &args.threads.to_string(), "--trace"]);
+            command.args([
+                "--repeats",
+                &args.repeats.to_string(),
+                "--threads",
+                &args.threads.to_string(),
+                "--trace",
+            ]);
             command.args(args.size.iter().map(ToString::to_string));
         }
         let status = command.status()?;

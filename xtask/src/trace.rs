@@ -76,7 +76,8 @@ struct Peer {
 }
 
 fn peers(args: &Args) -> Result<Vec<Peer>, Box<dyn Error>> {
-    let compile = |headers| peers::compile_nanovdb(headers).map(|(program, version)| Peer { program, version });
+    let compile =
+        |headers| peers::compile_nanovdb(headers).map(|(program, version)| Peer { program, version });
     if args.nanovdb.is_empty() {
         return Ok(vec![compile(None)?]);
     }
@@ -109,7 +110,10 @@ impl Bench<'_> {
         for format in Format::ALL {
             let output = self.folder.join(format!("{}.volpack", format.name()));
             let settings = Settings { format, ..Settings::default() };
-            build(&Job::new(vec![path.to_owned()], output.clone(), settings, VerifyLevel::None), &mut Silent)?;
+            build(
+                &Job::new(vec![path.to_owned()], output.clone(), settings, VerifyLevel::None),
+                &mut Silent,
+            )?;
             packs.push((format, Pack::open(&output)?));
         }
         let grid = &packs[0].1.grids[0];
