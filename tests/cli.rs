@@ -192,6 +192,12 @@ fn errors_say_what_to_do_and_exit_by_kind() {
     expect(build("frustum.vdb", &[]), 6, &["NonlinearFrustumMap"]);
     expect(build("nonfinite.vdb", &[]), 3, &["density", "nonfinite = \"zero\""]);
     expect(build("fog_half_zip.vdb", &["--format", "bc8"]), 2, &["bc7"]);
+    expect(build("fog_half_zip.vdb", &["--max-error", "5"]), 2, &["5", "\"5%\""]);
+    // So few bytes that nothing, or next to nothing, is left.
+    let few = ["--bits-per-voxel", "1", "-g"];
+    let ruined = |grid: &str| build("adversarial.vdb", &[&few[..], &[grid]].concat());
+    expect(ruined("checkerboards"), 4, &["checkerboards", "none of its 4,096 active voxels"]);
+    expect(build("adversarial.vdb", &["--size", "1KB", "-g", "two_values"]), 4, &["two_values", "dB is under 20 dB"]);
     expect(failure(&volpack(at, &["build"])), 2, &["pipeline.toml", "-o OUT.volpack"]);
     expect(failure(&volpack(at, &["build", &fix("tiles.vdb")])), 2, &["-o OUT.volpack"]);
     expect(failure(&volpack(at, &["verify", "none.volpack"])), 3, &["none.volpack"]);

@@ -189,7 +189,7 @@ struct PictureArgs {
     /// Write source, pack and difference side by side into this folder
     #[arg(long, value_name = "DIR")]
     images: Option<PathBuf>,
-    /// The largest mean FLIP that passes [default: by format, or as the manifest says]
+    /// The largest mean FLIP that passes [default: as the manifest says, else none: more than 0.04 is a warning]
     #[arg(long, value_name = "FLIP", value_parser = above_zero)]
     max_flip: Option<f64>,
     /// What traces the pack as an engine would
