@@ -197,7 +197,11 @@ fn errors_say_what_to_do_and_exit_by_kind() {
     let few = ["--bits-per-voxel", "1", "-g"];
     let ruined = |grid: &str| build("adversarial.vdb", &[&few[..], &[grid]].concat());
     expect(ruined("checkerboards"), 4, &["checkerboards", "none of its 4,096 active voxels"]);
-    expect(build("adversarial.vdb", &["--size", "1KB", "-g", "two_values"]), 4, &["two_values", "dB is under 20 dB"]);
+    expect(
+        build("adversarial.vdb", &["--size", "1KB", "-g", "two_values"]),
+        4,
+        &["two_values", "dB is under 20 dB"],
+    );
     expect(failure(&volpack(at, &["build"])), 2, &["pipeline.toml", "-o OUT.volpack"]);
     expect(failure(&volpack(at, &["build", &fix("tiles.vdb")])), 2, &["-o OUT.volpack"]);
     expect(failure(&volpack(at, &["verify", "none.volpack"])), 3, &["none.volpack"]);
