@@ -58,8 +58,9 @@ const SHAPES: [&[(f64, f64)]; 9] = [
 ];
 
 /// (method, colour, shape): fixed, so a method looks the same on every page.
-const KNOWN: [(&str, usize, usize); 10] = [
+const KNOWN: [(&str, usize, usize); 11] = [
     ("adaptive", 0, 0),
+    ("default", 1, 3),
     ("NanoVDB fpN", 1, 1),
     ("bc7", 2, 2),
     ("NanoVDB fp8", 3, 3),

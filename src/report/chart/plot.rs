@@ -12,6 +12,9 @@ use super::{ChartError, Point, pareto};
 
 /// Methods with a dial: their settings are joined into a line. The first also has its values written out.
 pub(super) const JOINED: [&str; 2] = ["adaptive", "NanoVDB fpN"];
+
+/// What is built when nothing is asked: a mark on one of the lines.
+const DEFAULT: &str = "default";
 pub(super) const FRONT: RGBColor = RGBColor(0xFB, 0xE4, 0x94);
 /// A clock in a build tool means little below this; zero seconds would have no place on a log axis.
 const SHORTEST: f64 = 1e-3;
@@ -271,12 +274,16 @@ impl Plot<'_> {
             if mates().count() > 1 {
                 texts.insert(0, (spot(d), name(d.point)));
             }
-            names.push((look_of(self.looks, &d.point.method), texts));
+            let place = if d.point.method == DEFAULT { 0 } else { names.len() };
+            names.insert(place, (look_of(self.looks, &d.point.method), texts));
         }
         spots.iter().for_each(|s| taken.mark(*s));
-        // Our lines above the rest, and failed marks on top: they are what a reader must not miss.
+        // Our lines above the rest, the default on its line, and failed marks on top: they are what a reader must not miss.
         let mut order: Vec<&Dot> = dots.iter().collect();
-        order.sort_by_key(|d| (!d.point.failures.is_empty(), JOINED.contains(&d.point.method.as_str())));
+        order.sort_by_key(|d| {
+            let method = d.point.method.as_str();
+            (!d.point.failures.is_empty(), method == DEFAULT, JOINED.contains(&method))
+        });
         for d in order {
             mark(root, spot(d), look_of(self.looks, &d.point.method), !d.point.failures.is_empty())?;
         }
