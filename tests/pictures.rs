@@ -245,7 +245,8 @@ fn what_rounding_decides_is_told_from_what_is_wrong() {
     };
     for f in 0..2 {
         let [far, wrong] = unexplained(f, &elsewhere);
-        assert!(wrong > 1000, "{far} pixels differ, {wrong} without a reason");
+        // Of 65,536, of which the picture ring lets 65 pass.
+        assert!(wrong > 300 && 2 * wrong > far, "{far} pixels differ, {wrong} without a reason");
     }
 }
 
