@@ -282,3 +282,14 @@ fn to_json(row: &Row) -> serde_json::Value {
     };
     json!({ "sequence": row.sequence, "grid": row.grid, "setting": row.setting, "seconds": row.seconds, "end": end })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_good_pack_of_the_fixtures_is_refused() {
+        let fixtures = crate::peers::root().join("fixtures");
+        run(&Args { folders: vec![fixtures], no_pictures: true, json: None }).unwrap();
+    }
+}
