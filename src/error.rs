@@ -72,16 +72,16 @@ pub enum Error {
     /// A source that changed while it was read.
     #[error("{}: the file changed while it was being read: build again when it is complete", .0.display())]
     Changed(PathBuf),
-    /// Something from the cache that its digest is right of and that is not what it should be.
+    /// A cache entry with a valid hash but inconsistent content.
     #[error("the cache misled the build: {0}")]
     Misled(String),
-    /// The user ended it.
-    #[error("interrupted: outputs are as they were, and what was done so far is kept for the next build")]
+    /// The user interrupted the build.
+    #[error("interrupted: output files were not changed; the next build continues from the cache")]
     Interrupted,
-    /// Limits that are past, a line each.
+    /// Budgets that were exceeded, a line each.
     #[error("over budget:{0}")]
     Budget(String),
-    /// A pack that does not say what its source says.
+    /// A pack that does not match its source.
     #[error("{0}")]
     Verify(String),
 }

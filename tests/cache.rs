@@ -347,7 +347,7 @@ fn a_build_is_explained() {
     let folder = shop.folder.path();
     fs::write(shop.path("pipeline.toml"), MANIFEST).unwrap();
     let explain = || stdout(&volpack(folder, &["explain", "puff"]));
-    assert!(explain().contains("because there is no puff.volpack"));
+    assert!(explain().contains("puff.volpack does not exist"));
     stdout(&volpack(folder, &["build", "--verify", "voxels"]));
     assert!(explain().contains("verify"), "pictures were not looked at");
     stdout(&volpack(folder, &["build", "--device", "auto"]));
@@ -359,10 +359,10 @@ fn a_build_is_explained() {
     fs::write(shop.path("pipeline.toml"), format!("{MANIFEST}psnr = 50\n")).unwrap();
     let text = explain();
     for line in [
-        "because quality was psnr 55 (level sets: max-error 0.05 voxels) and is psnr 50",
-        "because anim_0003.vdb changed",
-        "because anim_0009.vdb came",
-        "because anim_0008.vdb went",
+        "quality changed from psnr 55 (level sets: max-error 0.05 voxels) to psnr 50",
+        "anim_0003.vdb changed",
+        "anim_0009.vdb added",
+        "anim_0008.vdb removed",
         // What frame 3 is now, frame 2 was before.
         "flatten    1 of 8 frames: anim_0009.vdb",
     ] {
@@ -385,13 +385,13 @@ fn a_verification_without_a_device_is_kept_until_there_is_one() {
         command.env("VK_DRIVER_FILES", "/nowhere").env("VK_ICD_FILENAMES", "/nowhere").output().unwrap()
     };
     let first = stdout(&run(&["build"]));
-    assert!(first.contains("by the CPU tracer alone: no Vulkan device found"), "{first}");
+    assert!(first.contains("rendered on the CPU only: no Vulkan device found"), "{first}");
     assert_eq!(stdout(&run(&["explain"])), "puff: up to date\n");
     let again: Json = serde_json::from_str(&stdout(&run(&["build", "--json"]))).unwrap();
     assert_eq!(again["assets"][0]["cache"]["verify"], serde_json::json!({ "hits": 1, "misses": 0 }));
     if common::gpu().is_some() {
-        assert!(stdout(&volpack(folder, &["explain"])).contains("another device"));
-        assert!(!stdout(&volpack(folder, &["build"])).contains("by the CPU tracer alone"));
+        assert!(stdout(&volpack(folder, &["explain"])).contains("with this device"));
+        assert!(!stdout(&volpack(folder, &["build"])).contains("rendered on the CPU only"));
     }
 }
 

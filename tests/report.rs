@@ -89,14 +89,14 @@ fn json_is_as_its_schema_says_and_the_schema_is_documented() {
 #[test]
 fn every_limit_that_is_past_is_told_with_what_would_meet_it() {
     let cases = [
-        ("gpu_size = '1kB'", "puff: gpu_size: ", "no size would meet it: tree and masks are 7.6"),
-        ("gpu_size = '12kB'", "puff: gpu_size: ", "size = 12000 should meet it, in place of psnr"),
-        ("file_size = '7kB'", "puff: file_size: ", " should meet it, in place of psnr"),
+        ("gpu_size = '1kB'", "puff: gpu_size: ", "no size meets it: tree and masks take 7.6"),
+        ("gpu_size = '12kB'", "puff: gpu_size: ", "try `size = 12000` instead of `psnr`"),
+        ("file_size = '7kB'", "puff: file_size: ", "` instead of `psnr`"),
         ("tree_share = '1%'", "puff: tree_share: ", "a larger tree_share"),
-        ("min_psnr = 50", "puff: min_psnr: 4", "dB are under 50 dB; psnr = 50 would meet it"),
-        ("max_error = '0.1%'", "puff: max_error: ", "max_error = \"0.001\" would meet it, in place of psnr"),
-        ("max_flip = 0.00001", "puff: max_flip: 0.0", "should meet it"),
-        ("build_seconds = 0.000001", "puff: build_seconds: ", " are over 0 ms"),
+        ("min_psnr = 50", "puff: min_psnr: 4", "dB is below the 50 dB minimum; use `psnr = 50`"),
+        ("max_error = '0.1%'", "puff: max_error: ", "use `max_error = \"0.001\"` instead of `psnr`"),
+        ("max_flip = 0.00001", "puff: max_flip: 0.0", "; try `psnr = "),
+        ("build_seconds = 0.000001", "puff: build_seconds: ", " exceeds the 0 ms limit"),
     ];
     for (limit, start, remedy) in cases {
         let folder = shop("", limit);
@@ -131,8 +131,8 @@ fn what_is_said_to_meet_a_limit_meets_it() {
         let (code, json, said) = report(folder.path(), &["--asset", "puff"]);
         assert_eq!(code, 5, "{limit}: {said}");
         let remedy = json["breaches"][0]["remedy"].as_str().unwrap();
-        let end = [" should", " would"].iter().filter_map(|end| remedy.find(end)).min().unwrap();
-        write_manifest(folder.path(), "", &remedy[..end], limit);
+        let setting = remedy.split('`').nth(1).unwrap();
+        write_manifest(folder.path(), "", setting, limit);
         let (code, _, said) = report(folder.path(), &["--asset", "puff"]);
         assert_eq!(code, 0, "{limit} with {remedy}: {said}");
     }
@@ -167,12 +167,16 @@ fn changes_are_told_against_a_baseline() {
 
     write_manifest(folder.path(), "max_growth = '5%'\nmax_psnr_loss = 0.5", "psnr = 55", "");
     let (code, _, said) = report(folder.path(), baseline);
-    assert!(code == 5 && said.contains("puff: max_growth: the bytes on the GPU grew by "), "{said}");
+    assert!(code == 5 && said.contains("puff: max_growth: the size on the GPU grew by "), "{said}");
     assert!(fs::read_to_string(folder.path().join("r.md")).unwrap().contains("| GPU ↑ "));
 
     write_manifest(folder.path(), "max_growth = '5%'\nmax_psnr_loss = 0.5", "psnr = 40", "");
     let (code, _, said) = report(folder.path(), baseline);
-    assert!(code == 5 && said.contains("more than 0.5 dB are lost; psnr = 44.72 would meet it"), "{said}");
+    assert!(
+        code == 5
+            && said.contains("loses more than 0.5 dB against the baseline's 45.22 dB; use `psnr = 44.72`"),
+        "{said}"
+    );
     assert!(!said.contains("max_growth"), "{said}");
 
     fs::write(folder.path().join("old.json"), "{\"version\": 99}").unwrap();

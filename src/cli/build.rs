@@ -7,7 +7,7 @@ use serde_json::{Value as Json, json};
 
 use super::jobs::JobArgs;
 use super::progress::Reporter;
-use super::style::{GOOD, TITLE};
+use super::style::{ERROR, GOOD, TITLE};
 use super::{Common, outln, print_json};
 use crate::error::{Error, Result};
 use crate::pack::{Pack, Provenance};
@@ -17,15 +17,24 @@ use crate::report::{Breach, Checked, of_total};
 use crate::settings::Budget;
 use crate::{trace, units};
 
+const EXAMPLES: &str = "\
+Examples:
+  volpack build                                        every asset of pipeline.toml
+  volpack build smoke/*.vdb -o smoke.volpack           one sequence at the default quality
+  volpack build smoke/*.vdb -o smoke.volpack --size 20MB
+  volpack build fluid/*.vdb -o fluid.volpack -g phi --max-error \"0.02 voxels\"
+  volpack build --asset puff --images out/pictures     and pictures of source and pack";
+
 #[derive(Args)]
+#[command(after_help = EXAMPLES)]
 pub struct BuildArgs {
     #[command(flatten)]
     jobs: JobArgs,
-    /// Print what was built as JSON
-    #[arg(long)]
+    /// Print the result as JSON
+    #[arg(long, help_heading = "Output")]
     json: bool,
-    /// Write what each thread did and when, for chrome://tracing or ui.perfetto.dev
-    #[arg(long, value_name = "FILE.json")]
+    /// Write a profile of all threads, for chrome://tracing or ui.perfetto.dev
+    #[arg(long, value_name = "FILE.json", help_heading = "Output")]
     trace: Option<PathBuf>,
 }
 
@@ -112,7 +121,7 @@ fn build_one(name: &str, job: &Job, args: &BuildArgs, common: Common, asset: &mu
     asset["cache"] = json!(outcome.cache);
     if let Some(report) = &outcome.verification {
         super::verify::verdict(&job.output, report).map_err(|e| {
-            Error::Verify(format!("{e}\n  It was not written; --verify none writes it all the same."))
+            Error::Verify(format!("{e}\n  Not written. Use --verify none to write it anyway."))
         })?;
     }
     Ok(outcome)
@@ -121,12 +130,20 @@ fn build_one(name: &str, job: &Job, args: &BuildArgs, common: Common, asset: &mu
 fn print(name: &str, job: &Job, outcome: &Outcome, verbose: bool) {
     let pack = &outcome.summary;
     let bytes = units::bytes;
-    outln!("{TITLE}{name}{TITLE:#} -> {} ({})", job.output.display(), bytes(pack.file_bytes));
-    super::inspect::print_sizes(pack);
+    let verified = match &outcome.verification {
+        Some(report) if report.ok => format!("{GOOD}verified{GOOD:#}"),
+        Some(_) => format!("{ERROR}verification failed{ERROR:#}"),
+        None => "not verified".to_owned(),
+    };
+    let source: u64 =
+        job.frames.iter().filter_map(|file| std::fs::metadata(file).ok()).map(|file| file.len()).sum();
+    let share = 100.0 * pack.file_bytes as f64 / source.max(1) as f64;
+    let quality = outcome.verification.as_ref().map_or_else(String::new, super::verify::quality);
+    outln!("{TITLE}{name}{TITLE:#} -> {}", job.output.display());
+    outln!("  {} → {} ({share:.0} %), {quality}{verified}", bytes(source), bytes(pack.file_bytes));
+    super::inspect::print_sizes(pack, verbose);
     if let Some(report) = &outcome.verification {
-        super::verify::print_summary(report);
-    } else {
-        outln!("  not verified against its source (--verify)");
+        super::verify::print_details(report);
     }
     if verbose {
         for (stage, seconds) in &outcome.seconds {
@@ -139,7 +156,7 @@ fn print(name: &str, job: &Job, outcome: &Outcome, verbose: bool) {
     let total: f64 = outcome.seconds.iter().map(|(_, s)| s).sum();
     let how = match outcome.made {
         Made::Built => "done",
-        Made::Repacked => "packed anew from the cache",
+        Made::Repacked => "repacked from the cache",
         Made::Copied => "taken from the cache",
         Made::Unchanged => "up to date",
     };

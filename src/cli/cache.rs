@@ -21,24 +21,38 @@ use crate::units::{bytes, count};
 /// Where what builds make is kept.
 #[derive(Args, Clone)]
 pub struct CacheArgs {
-    /// Where what was made is kept for the next build [default: the platform's folder for caches]
-    #[arg(long = "cache", value_name = "DIR", env = "VOLPACK_CACHE", hide_env_values = true, global = true)]
+    /// Cache folder [default: the platform's cache folder]
+    #[arg(
+        long = "cache",
+        value_name = "DIR",
+        env = "VOLPACK_CACHE",
+        hide_env_values = true,
+        global = true,
+        help_heading = "Cache"
+    )]
     folder: Option<PathBuf>,
 }
 
 /// A cache behind it that machines share.
 #[derive(Args, Clone)]
 pub struct RemoteArgs {
-    /// A bucket behind it that machines share: s3://bucket/prefix, gs://bucket/prefix, az://container/prefix, with
-    /// credentials and options from AWS_*, GOOGLE_* or AZURE_* in the environment
-    #[arg(long = "remote-cache", value_name = "URL", env = "VOLPACK_REMOTE_CACHE", hide_env_values = true)]
+    /// Remote cache that machines share: s3://bucket/prefix, gs://bucket/prefix or az://container/prefix; credentials come
+    /// from AWS_*, GOOGLE_* or AZURE_* in the environment
+    #[arg(
+        long = "remote-cache",
+        value_name = "URL",
+        env = "VOLPACK_REMOTE_CACHE",
+        hide_env_values = true,
+        help_heading = "Cache"
+    )]
     url: Option<String>,
-    /// Whether what is made is uploaded as well
+    /// Whether to upload to the remote cache too
     #[arg(
         long = "remote-policy",
         value_name = "POLICY",
         env = "VOLPACK_REMOTE_POLICY",
-        default_value = "read-write"
+        default_value = "read-write",
+        help_heading = "Cache"
     )]
     policy: Policy,
 }
@@ -48,11 +62,11 @@ pub struct RemoteArgs {
 pub struct CacheChoice {
     #[command(flatten)]
     place: CacheArgs,
-    /// Make everything anew and keep nothing
-    #[arg(long)]
+    /// Rebuild everything and ignore the cache
+    #[arg(long, help_heading = "Cache")]
     no_cache: bool,
-    /// Hash sources that seem unchanged (size, times, inode) all the same
-    #[arg(long)]
+    /// Hash every source, also those whose size, times and inode did not change
+    #[arg(long, help_heading = "Cache")]
     pub paranoid: bool,
 }
 
@@ -129,20 +143,20 @@ pub struct Arguments {
 
 #[derive(Subcommand)]
 enum Command {
-    /// Say what is in the cache
+    /// Show what is in the cache
     Stats,
-    /// Remove what was not used for longest
+    /// Remove least recently used entries
     Gc {
-        /// Until the rest takes at most this much: 20GB, 512MiB
+        /// Size to shrink the cache to: 20GB, 512MiB
         #[arg(long, value_name = "SIZE", required_unless_present = "max_age")]
         max_size: Option<ByteSize>,
-        /// What was not used for this long: 30d, 12h
+        /// Age from which unused entries are removed: 30d, 12h
         #[arg(long, value_name = "AGE", value_parser = age)]
         max_age: Option<Duration>,
     },
-    /// Read every entry, and remove those that are damaged
+    /// Check every entry and remove damaged ones
     Verify,
-    /// Remove everything
+    /// Remove all entries
     Clear,
 }
 

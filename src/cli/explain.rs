@@ -14,10 +14,10 @@ use crate::pipeline::{Job, VerifyLevel, explain};
 
 #[derive(Args)]
 pub struct ExplainArgs {
-    /// The assets of the manifest; all of them where none are named
+    /// Assets of the manifest [default: all]
     #[arg(value_name = "ASSET")]
     assets: Vec<String>,
-    /// The manifest
+    /// Manifest to read
     #[arg(short, long, value_name = "FILE", default_value = DEFAULT_NAME)]
     manifest: PathBuf,
     #[command(flatten)]
@@ -46,7 +46,7 @@ pub fn run(args: &ExplainArgs) -> Result<()> {
         }
         outln!("{TITLE}{name}{TITLE:#}: {}", job.output.display());
         for reason in &explanation.reasons {
-            outln!("  because {reason}");
+            outln!("  {reason}");
         }
         for stage in &explanation.stages {
             outln!("    {:10} {}", stage.stage, stage.work);

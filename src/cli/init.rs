@@ -29,7 +29,7 @@ const MAX_DEPTH: usize = 16;
 
 #[derive(Args)]
 pub struct InitArgs {
-    /// The folder with the .vdb files; the manifest goes there
+    /// Folder with the .vdb files; the manifest is written there
     #[arg(default_value = ".")]
     folder: PathBuf,
 }

@@ -16,12 +16,12 @@ use crate::vdb::ValueType;
 
 #[derive(Args)]
 pub struct InspectArgs {
-    /// A .vdb or a .volpack
+    /// File to inspect, .vdb or .volpack
     file: PathBuf,
     /// Print JSON
     #[arg(long)]
     json: bool,
-    /// Read the voxels of a .vdb too, and say their range and sum
+    /// Read the voxels of a .vdb too, and print their range and sum
     #[arg(long)]
     values: bool,
 }
@@ -133,14 +133,14 @@ fn print_pack(path: &Path, pack: &Pack, summary: &PackSummary) {
         };
         outln!("  {TITLE}{}{TITLE:#}: {frames}, values {} to {}", grid.name, r.active_min, r.active_max);
     }
-    print_sizes(summary);
+    print_sizes(summary, true);
 }
 
-/// The lines that say what a pack holds and takes.
-pub fn print_sizes(p: &PackSummary) {
+/// Prints what a pack holds and its sizes; `with_codecs` adds a line for each codec.
+pub fn print_sizes(p: &PackSummary, with_codecs: bool) {
     let frames = if p.frames == 1 { "frame" } else { "frames" };
     outln!("  {} {frames}, {} bricks, {} unique", count(p.frames), count(p.bricks), count(p.unique_bricks));
-    for (codec, c) in &p.codecs {
+    for (codec, c) in p.codecs.iter().filter(|_| with_codecs) {
         // What has become background has no brick, but its error counts.
         let codec = if c.bricks == 0 { "empty" } else { codec };
         outln!(
@@ -152,7 +152,7 @@ pub fn print_sizes(p: &PackSummary) {
         );
     }
     outln!(
-        "  GPU {}: tree {}, masks {}, texels {}; {:.3} bits a voxel",
+        "  {} on the GPU: tree {}, masks {}, texels {}; {:.3} bits per voxel",
         bytes(p.gpu_bytes),
         bytes(p.tree_bytes),
         bytes(p.mask_bytes),

@@ -17,24 +17,24 @@ use crate::volume::ScratchFolder;
 
 #[derive(Args)]
 pub struct JobArgs {
-    /// The files of one sequence, in place of a manifest
+    /// Files of one sequence, instead of a manifest
     #[arg(value_name = "FILES", conflicts_with_all = ["manifest", "assets"])]
     pub frames: Vec<PathBuf>,
-    /// The pack to write, with FILES
-    #[arg(short, long, value_name = "OUT.volpack", requires = "frames")]
-    output: Option<PathBuf>,
-    /// The manifest
-    #[arg(short, long, value_name = "FILE", default_value = DEFAULT_NAME)]
+    /// Manifest to read
+    #[arg(short, long, value_name = "FILE", default_value = DEFAULT_NAME, help_heading = "Input")]
     manifest: PathBuf,
-    /// Build only this asset of the manifest; may be given more than once
-    #[arg(long = "asset", value_name = "NAME")]
+    /// Asset of the manifest to build; repeat for several [default: all]
+    #[arg(long = "asset", value_name = "NAME", help_heading = "Input")]
     assets: Vec<String>,
+    /// Pack to write, for FILES
+    #[arg(short, long, value_name = "OUT.volpack", requires = "frames", help_heading = "Output")]
+    output: Option<PathBuf>,
     #[command(flatten)]
     settings: SettingsArgs,
     #[command(flatten)]
     verify: VerifyArg,
-    /// Make warnings errors: a missing frame, a grid that some frames lack
-    #[arg(long)]
+    /// Treat warnings as errors, for example a missing frame
+    #[arg(long, help_heading = "Input")]
     strict: bool,
     #[command(flatten)]
     cache: CacheChoice,
@@ -42,9 +42,8 @@ pub struct JobArgs {
     remote: RemoteArgs,
     #[command(flatten)]
     memory: MemoryArg,
-    /// Where what does not fit in memory is meanwhile [default: in the cache, else the system's folder for temporary
-    /// files]
-    #[arg(long, value_name = "DIR", env = "VOLPACK_SCRATCH")]
+    /// Directory for temporary spill files [default: the cache folder, else the system's temporary folder]
+    #[arg(long, value_name = "DIR", env = "VOLPACK_SCRATCH", help_heading = "General")]
     scratch: Option<PathBuf>,
 }
 
@@ -97,7 +96,7 @@ impl JobArgs {
             let output = self
                 .output
                 .as_deref()
-                .ok_or_else(|| Error::Usage("FILES need a pack to go into: add -o OUT.volpack".to_owned()))?;
+                .ok_or_else(|| Error::Usage("no output given: add -o OUT.volpack".to_owned()))?;
             let name = stem(output);
             let settings = self.settings.settings()?;
             return Ok(vec![(name, expand(&self.frames).map(|f| job(f, output, settings, None)))]);

@@ -33,15 +33,15 @@ Exit codes:
   1  failed for another reason, such as a full disk
   2  wrong usage: an unknown option, grid or asset
   3  a file that cannot be read or is invalid
-  4  verification failed: a pack does not say what its source says
+  4  verification failed: a pack does not match its source
   5  over budget
   6  not supported here: a grid type, file version or device
-  130  ended by Ctrl-C: outputs are as they were";
+  130  ended by Ctrl-C: output files were not changed";
 
-/// Turns OpenVDB volumes and animation sequences into game-ready volume packs, and proves each pack
+/// Turns OpenVDB volumes and animation sequences into game-ready volume packs, and verifies each pack
 /// against its source.
 #[derive(Parser)]
-#[command(name = "volpack", version, after_help = EXIT_CODES, max_term_width = 100)]
+#[command(name = "volpack", version, disable_help_flag = true, after_help = EXIT_CODES, max_term_width = 100)]
 pub struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -51,36 +51,39 @@ pub struct Cli {
 
 #[derive(Args, Clone, Copy)]
 struct Common {
-    /// Print nothing but errors
-    #[arg(short, long, global = true)]
+    /// Print errors only
+    #[arg(short, long, global = true, display_order = 100, help_heading = "General")]
     quiet: bool,
-    /// Say more: seconds by stage, every frame
-    #[arg(short, long, global = true)]
+    /// Print more: seconds by stage, codecs, every frame
+    #[arg(short, long, global = true, display_order = 101, help_heading = "General")]
     verbose: bool,
-    /// Threads to use; all cores where none are given
-    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
+    /// Number of threads [default: all cores]
+    #[arg(long, global = true, display_order = 102, help_heading = "General", value_name = "N", value_parser = clap::value_parser!(u16).range(1..=1024))]
     threads: Option<u16>,
+    /// Print help (-h: in short)
+    #[arg(short, long, global = true, display_order = 103, help_heading = "General", action = clap::ArgAction::Help)]
+    help: Option<bool>,
 }
 
 #[derive(Subcommand)]
 enum Command {
     /// Build packs from a manifest, or one pack from files
     Build(Box<build::BuildArgs>),
-    /// Build what changed whenever frames land
+    /// Rebuild assets whenever their files change
     Watch(Box<watch::WatchArgs>),
-    /// Say which stages a build would run, and why
+    /// Show which stages a build would run, and why
     Explain(explain::ExplainArgs),
-    /// Look after what builds keep
+    /// Inspect and clean the cache
     Cache(cache::Arguments),
     /// Find the sequences in a folder and write a manifest for them
     Init(init::InitArgs),
-    /// Say what is in a .vdb or a .volpack
+    /// Show what is in a .vdb or a .volpack
     Inspect(inspect::InspectArgs),
-    /// Prove a pack against its source
+    /// Verify a pack against its source
     Verify(verify::VerifyArgs),
-    /// Trace pictures of a pack
+    /// Render pictures of a pack
     Render(render::RenderArgs),
-    /// Put sizes, quality and budgets on one page, and into JSON, Markdown and JUnit XML
+    /// Report sizes, quality and budgets as HTML, JSON, Markdown or JUnit XML
     Report(Box<report::ReportArgs>),
     /// Measure many settings of a volume and chart quality against size and speed
     Sweep(sweep::SweepArgs),
@@ -89,41 +92,41 @@ enum Command {
 /// How a pack is made, for builds without a manifest.
 #[derive(Args)]
 struct SettingsArgs {
-    /// A grid to pack; may be given more than once [default: density, else the only scalar grid]
-    #[arg(short, long = "grid", value_name = "NAME")]
+    /// Grid to pack; repeat for several [default: density, else the only scalar grid]
+    #[arg(short, long = "grid", value_name = "NAME", help_heading = "Input")]
     grids: Vec<String>,
-    /// How bricks are stored [default: adaptive]
-    #[arg(short, long)]
+    /// Codec of the bricks [default: adaptive]
+    #[arg(short, long, help_heading = "Quality")]
     format: Option<Format>,
     #[command(flatten)]
     quality: QualityArgs,
     #[command(flatten)]
     clusters: ClusterArgs,
-    /// What the 0 and 1 of unorm8, bc4 and bc7 texels stand for [default: brick]
-    #[arg(short, long)]
+    /// Value range that unorm8, bc4 and bc7 texels are normalised to [default: brick]
+    #[arg(short, long, help_heading = "Quality")]
     range: Option<RangeMode>,
-    /// Whether bricks keep their active masks [default: auto]
-    #[arg(long)]
+    /// Which bricks keep their active masks [default: auto]
+    #[arg(long, help_heading = "Quality")]
     masks: Option<Masks>,
-    /// What to do with infinities and NaNs [default: refuse]
-    #[arg(long)]
+    /// Treatment of infinities and NaNs [default: refuse]
+    #[arg(long, help_heading = "Input")]
     nonfinite: Option<NonFinite>,
-    /// What becomes of grids of integers [default: keep]
-    #[arg(long)]
+    /// Treatment of integer grids [default: keep]
+    #[arg(long, help_heading = "Input")]
     integers: Option<Integers>,
-    /// zstd level of the file, 0 to store everything raw [default: 3]
-    #[arg(long, value_name = "LEVEL", value_parser = clap::value_parser!(i32).range(0..=22))]
+    /// zstd level of the file, 1 to 22; 0 for no compression [default: 3]
+    #[arg(long, value_name = "LEVEL", value_parser = clap::value_parser!(i32).range(0..=22), help_heading = "Output")]
     zstd: Option<i32>,
-    /// Frames per second, for engines that play the pack
-    #[arg(long, value_name = "RATE", value_parser = positive)]
+    /// Frame rate recorded in the pack, in frames per second
+    #[arg(long, value_name = "RATE", value_parser = positive, help_heading = "Output")]
     fps: Option<f32>,
 }
 
 /// How much memory work may take.
 #[derive(Args)]
 struct MemoryArg {
-    /// The most memory to take, without that of a Vulkan driver: fewer frames are read at a time
-    #[arg(long, value_name = "SIZE")]
+    /// Memory limit, for example 1GB; the Vulkan driver's memory is not counted [default: none]
+    #[arg(long, value_name = "SIZE", help_heading = "General")]
     memory: Option<ByteSize>,
 }
 
@@ -176,8 +179,8 @@ impl SettingsArgs {
 /// How much a pack is checked, as the command line has it.
 #[derive(Args)]
 struct VerifyArg {
-    /// How much of the finished pack is checked [default: all, for watch: voxels]
-    #[arg(long, value_name = "LEVEL")]
+    /// How much of the finished pack to verify [default: all, for watch: voxels]
+    #[arg(long, value_name = "LEVEL", help_heading = "Verification")]
     verify: Option<VerifyLevel>,
     #[command(flatten)]
     pictures: PictureArgs,
@@ -186,14 +189,14 @@ struct VerifyArg {
 /// How pictures are compared, as the command line has it.
 #[derive(Args)]
 struct PictureArgs {
-    /// Write source, pack and difference side by side into this folder
-    #[arg(long, value_name = "DIR")]
+    /// Write pictures of source, pack and difference into this folder
+    #[arg(long, value_name = "DIR", help_heading = "Verification")]
     images: Option<PathBuf>,
-    /// The largest mean FLIP that passes [default: as the manifest says, else none: more than 0.04 is a warning]
-    #[arg(long, value_name = "FLIP", value_parser = above_zero)]
+    /// Maximum visual difference (mean FLIP, 0 to 1) [default: the manifest's; if there is none, more than 0.04 is a warning]
+    #[arg(long, value_name = "FLIP", value_parser = above_zero, help_heading = "Verification")]
     max_flip: Option<f64>,
-    /// What traces the pack as an engine would
-    #[arg(long, default_value = "auto")]
+    /// Device that renders the pictures
+    #[arg(long, default_value = "auto", help_heading = "Verification")]
     device: Device,
 }
 

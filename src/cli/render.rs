@@ -14,36 +14,36 @@ use crate::render::{Device, Interpolation, Mode, Renderer, Scene, Traversal, Vie
 
 #[derive(Args)]
 pub struct RenderArgs {
-    /// The pack
+    /// Pack to render
     pack: PathBuf,
-    /// The picture to write: .png, or .apng for --frames all
+    /// Picture to write: .png, or .apng with --frames all
     #[arg(short, long, value_name = "OUT.png")]
     output: PathBuf,
-    /// The number of the frame [default: the first]
+    /// Frame number [default: the first]
     #[arg(long, value_name = "N", allow_negative_numbers = true)]
     frame: Option<i32>,
-    /// Every frame: a contact sheet, or an animation if OUT ends in .apng
+    /// Render every frame: a contact sheet, or an animation if OUT ends in .apng
     #[arg(long, value_name = "WHICH", conflicts_with = "frame")]
     frames: Option<Frames>,
-    /// The grid [default: the first]
+    /// Grid to render [default: the first]
     #[arg(short, long, value_name = "NAME")]
     grid: Option<String>,
-    /// What the picture shows [default: density, lit for level sets]
+    /// What to show [default: density, lit for level sets]
     #[arg(long)]
     mode: Option<Mode>,
-    /// Pixels of a frame
+    /// Size of a frame in pixels
     #[arg(long, value_name = "WxH", default_value = "512x512", value_parser = size)]
     size: [u32; 2],
-    /// orbit:AZIMUTH,ELEVATION,DISTANCE in degrees and box diagonals, or "X,Y,Z;X,Y,Z;FOV" (eye; target)
+    /// Camera: orbit:AZIMUTH,ELEVATION,DISTANCE in degrees and box diagonals, or "X,Y,Z;X,Y,Z;FOV" (eye; target; degrees)
     #[arg(long, value_name = "VIEW", default_value = "orbit:40,20,1.25")]
     camera: View,
-    /// What traces
+    /// Device that renders
     #[arg(long, default_value = "auto")]
     device: Device,
-    /// How rays step
+    /// How rays step through the tree
     #[arg(long, default_value = "hdda")]
     traversal: Traversal,
-    /// What a level set is between its voxels
+    /// Interpolation of level sets
     #[arg(long, default_value = "trilinear")]
     interpolation: Interpolation,
 }

@@ -28,40 +28,40 @@ use crate::verify::PictureSettings;
 
 #[derive(Args)]
 pub struct ReportArgs {
-    /// Finished packs, in place of a manifest's assets
+    /// Finished packs, instead of a manifest's assets
     #[arg(value_name = "PACKS", conflicts_with_all = ["manifest", "assets"])]
     packs: Vec<PathBuf>,
-    /// The manifest: its assets are built, or taken from the cache
+    /// Manifest whose assets are built, or taken from the cache
     #[arg(short, long, value_name = "FILE", default_value = DEFAULT_NAME)]
     manifest: PathBuf,
-    /// Only this asset of the manifest; may be given more than once
+    /// Asset of the manifest to report; repeat for several [default: all]
     #[arg(long = "asset", value_name = "NAME")]
     assets: Vec<String>,
-    /// With PACKS: the files that they were made from, to compare them with
+    /// Source files of PACKS, to compare them with
     #[arg(long, value_name = "FILES", num_args = 1.., requires = "packs")]
     source: Vec<PathBuf>,
-    /// Write one page with pictures and charts
+    /// Write an HTML page with pictures and charts
     #[arg(long, value_name = "FILE")]
     html: Option<PathBuf>,
-    /// Write every figure (volpack report --schema says what is in it)
+    /// Write every figure as JSON (schema: volpack report --schema)
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Write a table for a review comment
+    /// Write a Markdown table for a review comment
     #[arg(long, value_name = "FILE")]
     markdown: Option<PathBuf>,
     /// Write test results as JUnit XML
     #[arg(long, value_name = "FILE")]
     junit: Option<PathBuf>,
-    /// The JSON of an older report: changes are told against it
+    /// JSON of an older report, to list changes against
     #[arg(long, value_name = "FILE")]
     baseline: Option<PathBuf>,
-    /// Leave out what the next cheaper setting would cost
+    /// Skip the possible savings, which need further builds
     #[arg(long)]
     no_cheaper: bool,
-    /// How problems are printed
+    /// How to print problems
     #[arg(long, value_name = "FORMAT", default_value = "text")]
     format: Lines,
-    /// Print the JSON schema of --json and end
+    /// Print the JSON schema of --json and exit
     #[arg(long)]
     schema: bool,
     #[command(flatten)]

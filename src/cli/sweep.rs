@@ -19,25 +19,26 @@ use crate::units::psnr;
 
 #[derive(Args)]
 pub struct SweepArgs {
-    /// The files of one sequence
+    /// Files of one sequence
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// The folder for sweep.csv, sweep.json and sweep.svg
+    /// Folder for sweep.csv, sweep.json and sweep.svg
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
-    /// Repeat each method with other seeds, frame orders, thread counts and noise: stability.csv, .json and .svg
+    /// Measure stability instead: repeat each method with other seeds, frame orders, thread counts and noise, and write
+    /// stability.csv, stability.json and stability.svg
     #[arg(long, conflicts_with_all = ["repeats", "trace"])]
     stability: bool,
-    /// The grid [default: density, else the only scalar grid]
+    /// Grid to measure [default: density, else the only scalar grid]
     #[arg(short, long, value_name = "NAME")]
     grid: Option<String>,
-    /// What to do with infinities and NaNs
+    /// Treatment of infinities and NaNs
     #[arg(long, default_value = "refuse")]
     nonfinite: NonFinite,
-    /// How often builds and pictures are timed at least: the fastest build and the median picture count
+    /// Minimum number of timed builds and pictures; the fastest build and the median picture count
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = clap::value_parser!(u32).range(1..=1000))]
     repeats: u32,
-    /// Pixels of the pictures that are traced where there is a GPU; 0 0 to trace none
+    /// Size of the pictures timed on the GPU, in pixels; 0 0 for none
     #[arg(long, num_args = 2, value_names = ["WIDTH", "HEIGHT"], default_values_t = [960, 540])]
     trace: Vec<u32>,
 }

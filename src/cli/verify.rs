@@ -16,15 +16,15 @@ use crate::verify::{PicturesReport, VerifyReport};
 
 #[derive(Args)]
 pub struct VerifyArgs {
-    /// The pack
+    /// Pack to verify
     pack: PathBuf,
-    /// The files that it was made from; without them the manifest is asked
+    /// Source files of the pack [default: those of the manifest]
     #[arg(long, value_name = "FILES", num_args = 1..)]
     source: Vec<PathBuf>,
-    /// The manifest that says where the sources are
+    /// Manifest that names the source files
     #[arg(short, long, value_name = "FILE", default_value = DEFAULT_NAME)]
     manifest: PathBuf,
-    /// How much is checked
+    /// How much to verify
     #[arg(long, value_name = "RING", default_value = "all")]
     level: Level,
     #[command(flatten)]
@@ -38,11 +38,11 @@ pub struct VerifyArgs {
 
 #[derive(Clone, Copy, PartialEq, ValueEnum)]
 enum Level {
-    /// Digests, offsets, indices and counts: needs no source
+    /// Digests, offsets, indices and counts; needs no source
     Structure,
-    /// Those, and every voxel against the source
+    /// The structure, and every voxel against the source
     Voxels,
-    /// Those, and pictures of pack and source
+    /// The structure, every voxel, and pictures of pack and source
     All,
 }
 
@@ -83,7 +83,7 @@ pub fn verdict(pack: &Path, report: &VerifyReport) -> Result<()> {
         return Ok(());
     }
     Err(Error::Verify(format!(
-        "{} does not say what its source says:\n  {}",
+        "{} does not match its source:\n  {}",
         pack.display(),
         report.failures.join("\n  ")
     )))
@@ -93,7 +93,7 @@ pub fn verdict(pack: &Path, report: &VerifyReport) -> Result<()> {
 fn sources_in_manifest(args: &VerifyArgs) -> Result<(Vec<PathBuf>, Option<f64>)> {
     let unknown = || {
         Error::Usage(format!(
-            "{}: which files was it made from? Give --source FILES, or a manifest that builds it with -m",
+            "{}: source files unknown: give --source FILES, or the manifest that builds it with -m",
             args.pack.display()
         ))
     };
@@ -107,15 +107,35 @@ fn sources_in_manifest(args: &VerifyArgs) -> Result<(Vec<PathBuf>, Option<f64>)>
     Ok((expand(&asset.frames)?, asset.max_flip))
 }
 
-/// The lines that say how near a pack is to its source.
+/// Prints whether a pack matches its source, and how closely.
 pub fn print_summary(report: &VerifyReport) {
-    let verdict = if report.ok { format!("{GOOD}ok{GOOD:#}") } else { format!("{ERROR}failed{ERROR:#}") };
-    outln!("  verified against its source: {verdict}");
+    let verdict =
+        if report.ok { format!("{GOOD}verified{GOOD:#}") } else { format!("{ERROR}failed{ERROR:#}") };
+    outln!("  {}{verdict}", quality(report));
+    print_details(report);
+}
+
+/// The PSNR of the least exact grid and of the worst frame, as the beginning of a sentence: "55.00 dB, worst frame 51.45 dB, ".
+pub fn quality(report: &VerifyReport) -> String {
+    let mut text = format!("{}, ", psnr(report.active.psnr));
+    if let (Some(worst), true) = (&report.worst_frame, report.frames.len() > 1) {
+        text += &format!("worst frame {:.2} dB, ", worst.psnr);
+    }
+    text
+}
+
+/// Prints the errors of each grid and what the pictures showed.
+pub fn print_details(report: &VerifyReport) {
     for grid in &report.grids {
         let m = &grid.active;
+        let percent = |error: f64| 100.0 * error / grid.peak;
         let flips = if m.sign_flips > 0 { format!(", {} sign flips", m.sign_flips) } else { String::new() };
         let error = if m.max_error > 0.0 {
-            format!(", RMSE {:.3e}, largest error {:.3e} of {:.3e}", m.rmse, m.max_error, grid.peak)
+            format!(
+                ", RMSE {:.2} %, maximum error {:.2} % of the value range",
+                percent(m.rmse),
+                percent(m.max_error)
+            )
         } else {
             String::new()
         };
@@ -134,11 +154,11 @@ fn print_pictures(report: &PicturesReport) {
     match (&report.device, &report.skipped) {
         (Some(device), _) => {
             let pixels: u64 = of_tracers.map(|t| t.pixels).sum();
-            let pixels = if pixels == 0 { "no".to_owned() } else { pixels.to_string() };
-            outln!("    pictures     {device} and the CPU tracer: {pixels} pixels differ");
+            let verdict = if pixels == 0 { "match".to_owned() } else { format!("differ in {pixels} pixels") };
+            outln!("    pictures     {device} and the CPU reference {verdict}");
         }
-        (None, Some(why)) => outln!("    pictures     by the CPU tracer alone: {why}"),
-        (None, None) => outln!("    pictures     by the CPU tracer alone"),
+        (None, Some(why)) => outln!("    pictures     rendered on the CPU only: {why}"),
+        (None, None) => outln!("    pictures     rendered on the CPU only"),
     }
     let worst = report.pictures.iter().max_by(|a, b| a.source.flip.total_cmp(&b.source.flip));
     if let Some(p) = worst {

@@ -14,7 +14,7 @@ use crate::error::{Error, Result};
 use crate::interrupt;
 use crate::pipeline::{Job, Made, Outcome, Progress, VerifyLevel, build};
 use crate::settings::Settings;
-use crate::units::{bytes, psnr, seconds};
+use crate::units::{bytes, count, psnr, seconds};
 
 /// How often files are looked at. Asking beats being told: network drives, where farms render to, tell nothing.
 const LOOK_EVERY: Duration = Duration::from_millis(200);
@@ -26,7 +26,7 @@ const STILL_WRITTEN: Duration = Duration::from_secs(10);
 pub struct WatchArgs {
     #[command(flatten)]
     jobs: JobArgs,
-    /// How long files must stay as they are before they are built, in seconds
+    /// How long files must be unchanged before they are built, in seconds
     #[arg(long, value_name = "SECONDS", default_value = "1", value_parser = super::above_zero)]
     settle: f64,
 }
@@ -172,7 +172,8 @@ fn summary(outcome: &Outcome) -> String {
         Made::Repacked => format!("{GOOD}packed anew{GOOD:#}"),
         Made::Built => match outcome.cache.get("outline") {
             Some(uses) => {
-                format!("{GOOD}built{GOOD:#}, {} of {} read anew", uses.misses, uses.hits + uses.misses)
+                let read = if uses.misses == 0 { "none".to_owned() } else { count(uses.misses) };
+                format!("{GOOD}built{GOOD:#}, {read} of {} frames re-read", uses.hits + uses.misses)
             }
             None => format!("{GOOD}built{GOOD:#}"),
         },

@@ -48,15 +48,14 @@ pub fn explain(job: &Job) -> Result<Explanation> {
     }
     match (is_there, has_pack, has_other_level) {
         (true, ..) => {}
-        (_, true, _) => say("serialise", "copied from the cache".to_owned()),
-        (.., true) => say("serialise", format!("packed anew at zstd {}, from the cache", job.settings.zstd)),
+        (_, true, _) => say("serialise", "copy from the cache".to_owned()),
+        (.., true) => say("serialise", format!("repack from the cache at zstd level {}", job.settings.zstd)),
         _ => say("serialise", "all".to_owned()),
     }
     if !is_verified {
         say("verify", "voxels and pictures".to_owned());
         if is_there {
-            out.reasons
-                .push("it was not verified by voxels and pictures, or another device traced them".to_owned());
+            out.reasons.push("not yet verified with this device".to_owned());
         }
     }
     Ok(out)
@@ -70,11 +69,11 @@ fn stages(job: &Job, plan: &Plan, say: &mut impl FnMut(&'static str, String)) {
         say("flatten", format!("{} of {all} frames: {}", unknown.len(), listed(&unknown)));
     }
     say("dedup", format!("{all} frames"));
-    say("allocate", "all bricks, from what the cache knows of them".to_owned());
+    say("allocate", "all bricks, with measurements from the cache".to_owned());
     if unknown.len() == all {
         say("quantise", "all bricks".to_owned());
     } else {
-        say("quantise", "bricks of those frames, and what else is asked for and not in the cache".to_owned());
+        say("quantise", "the bricks of those frames, and others that are not in the cache".to_owned());
     }
 }
 
@@ -88,15 +87,15 @@ fn reasons(job: &Job, new: &Provenance) -> Vec<String> {
             Ok(provenance) => provenance,
             Err(e) => return vec![format!("{}: {e}", job.output.display())],
         },
-        Err(_) if !job.output.exists() => return vec![format!("there is no {}", job.output.display())],
+        Err(_) if !job.output.exists() => return vec![format!("{} does not exist", job.output.display())],
         Err(e) => return vec![format!("{} cannot be used: {e}", job.output.display())],
     };
     let mut reasons = Vec::new();
     if old.version != new.version {
-        reasons.push(format!("volpack {} made it, this is {}", old.version, new.version));
+        reasons.push(format!("built by volpack {}, this is {}", old.version, new.version));
     }
     if old.encoder_isa.is_some() && new.encoder_isa.is_some() && old.encoder_isa != new.encoder_isa {
-        reasons.push("its blocks were made for another instruction set".to_owned());
+        reasons.push("encoded for another instruction set".to_owned());
     }
     let settings = |provenance: &Provenance| {
         let mut settings = serde_json::to_value(&provenance.settings).unwrap_or_default();
@@ -108,7 +107,11 @@ fn reasons(job: &Job, new: &Provenance) -> Vec<String> {
         for (key, new) in &new {
             let old = old.get(key).unwrap_or(&Json::Null);
             if old != new {
-                reasons.push(format!("{key} was {} and is {}", text(old), text(new)));
+                reasons.push(match (old, new) {
+                    (Json::Null, new) => format!("{key} set to {}", text(new)),
+                    (old, Json::Null) => format!("{key} removed (was {})", text(old)),
+                    (old, new) => format!("{key} changed from {} to {}", text(old), text(new)),
+                });
             }
         }
     }
@@ -121,8 +124,8 @@ fn reasons(job: &Job, new: &Provenance) -> Vec<String> {
     let is_gone = |s: &Source| !new.sources.iter().any(|n| n.file == s.file);
     for (files, what) in [
         (files(&new.sources, &differs), "changed"),
-        (files(&new.sources, &is_new), "came"),
-        (files(&old.sources, &is_gone), "went"),
+        (files(&new.sources, &is_new), "added"),
+        (files(&old.sources, &is_gone), "removed"),
     ] {
         reasons.extend((!files.is_empty()).then(|| format!("{} {what}", listed(&files))));
     }

@@ -1,4 +1,4 @@
-//! What is past its limit, and which setting would meet it.
+//! Budgets that are exceeded, and which setting would meet them.
 
 use schemars::JsonSchema;
 use serde::Serialize;
@@ -10,7 +10,7 @@ use crate::units::{bytes, seconds};
 use crate::vdb::voxel_size;
 use crate::verify::VerifyReport;
 
-/// A limit that is past.
+/// An exceeded budget.
 #[derive(Clone, Debug, Serialize, JsonSchema)]
 pub struct Breach {
     /// The asset; null for all of them together.
@@ -58,7 +58,7 @@ pub struct Checked<'a> {
 }
 
 impl Checked<'_> {
-    /// Every limit that the pack is past.
+    /// Every budget that the pack exceeds.
     pub fn breaches(&self) -> Vec<Breach> {
         let past = [self.sizes(), self.quality(), self.time(), self.changes()];
         past.into_iter().flatten().collect()
@@ -83,7 +83,7 @@ impl Checked<'_> {
 
     fn sizes(&self) -> Vec<Breach> {
         let (budget, figures) = (self.budget, self.figures);
-        let over = |is: u64, limit: u64| format!("{} are over {}", bytes(is), bytes(limit));
+        let over = |is: u64, limit: u64| format!("{} exceeds the {} limit", bytes(is), bytes(limit));
         let mut out = Vec::new();
         if let Some(limit) = budget.gpu_size.map(|size| size.0).filter(|limit| figures.gpu_bytes > *limit) {
             let message = over(figures.gpu_bytes, limit);
@@ -98,12 +98,11 @@ impl Checked<'_> {
         if let Some(limit) =
             budget.tree_share.map(|share| share.0).filter(|limit| figures.tree_share > *limit)
         {
-            let message = format!("{:.1} % are over {:.1} %", figures.tree_share * 100.0, limit * 100.0);
+            let message =
+                format!("{:.1} % exceeds the {:.1} % limit", figures.tree_share * 100.0, limit * 100.0);
             let remedy = match self.settings.masks {
-                Masks::Keep => "masks = \"auto\" drops those that nothing needs",
-                _ => {
-                    "the tree is the volume's shape: a larger tree_share, or more texels to it by a finer psnr"
-                }
+                Masks::Keep => "use `masks = \"auto\"`, which drops masks that nothing needs",
+                _ => "the tree follows the volume's shape: allow a larger tree_share",
             };
             out.push(self.breach("tree_share", Some(figures.tree_share), limit, message, remedy.to_owned()));
         }
@@ -116,8 +115,8 @@ impl Checked<'_> {
         if let Some(limit) = budget.min_psnr.filter(|_| !figures.exact) {
             match figures.psnr {
                 Some(psnr) if psnr < limit => {
-                    let message = format!("{psnr:.2} dB are under {limit} dB");
-                    let remedy = self.adaptive(&format!("psnr = {limit}"), "would");
+                    let message = format!("{psnr:.2} dB is below the {limit} dB minimum");
+                    let remedy = self.adaptive(&format!("psnr = {limit}"), "use");
                     out.push(self.breach("min_psnr", Some(psnr), limit, message, remedy));
                 }
                 Some(_) => {}
@@ -139,14 +138,14 @@ impl Checked<'_> {
                     // FLIP falls more slowly than the error: to half for 6 to 9 dB.
                     let finer = |psnr: f64| ((psnr + 30.0 * (flip / limit).log10()) * 2.0).ceil() / 2.0;
                     let remedy = figures.psnr.map_or_else(
-                        || "format = \"f32\" is exact".to_owned(),
-                        |psnr| self.adaptive(&format!("psnr = {}", finer(psnr)), "should"),
+                        || "use `format = \"f32\"`, which is exact".to_owned(),
+                        |psnr| self.adaptive(&format!("psnr = {}", finer(psnr)), "try"),
                     );
                     out.push(self.breach(
                         "max_flip",
                         Some(flip),
                         limit,
-                        format!("{flip:.4} is over {limit}"),
+                        format!("{flip:.4} exceeds the {limit} limit"),
                         remedy,
                     ));
                 }
@@ -168,8 +167,8 @@ impl Checked<'_> {
         let past = grids.filter_map(|(report, grid)| {
             let voxel = grid.frames.first().map_or(1.0, |frame| voxel_size(&frame.record.transform));
             let (error, limit) = (report.active.max_error, bound.absolute(report.peak, voxel));
-            let message = format!("{error:.3e} of {} is over {limit:.3e} ({bound})", report.grid);
-            let remedy = self.adaptive(&format!("max_error = \"{bound}\""), "would");
+            let message = format!("{error:.3e} of {} exceeds the {limit:.3e} limit ({bound})", report.grid);
+            let remedy = self.adaptive(&format!("max_error = \"{bound}\""), "use");
             (error > limit).then(|| self.breach("max_error", Some(error), limit, message, remedy))
         });
         past.collect()
@@ -184,9 +183,10 @@ impl Checked<'_> {
         let remedy = if all - verify <= limit {
             format!("verification took {}: build with --verify structure", seconds(verify))
         } else {
-            "a cache (no --no-cache) leaves only what changed; format = \"unorm8\" needs no search".to_owned()
+            "build with the cache (without --no-cache), or use `format = \"unorm8\"`, which needs no search"
+                .to_owned()
         };
-        let message = format!("{} are over {}", seconds(all), seconds(limit));
+        let message = format!("{} exceeds the {} limit", seconds(all), seconds(limit));
         vec![self.breach("build_seconds", Some(all), limit, message, remedy)]
     }
 
@@ -197,7 +197,10 @@ impl Checked<'_> {
         if let Some(limit) = self.budget.max_growth.map(|share| share.0) {
             let grew = |what: &str, growth: f64, old: u64| {
                 let (growth, limit) = (growth * 100.0, limit * 100.0);
-                format!("the bytes {what} grew by {growth:.1} % from {}, over {limit:.1} %", bytes(old))
+                format!(
+                    "the size {what} grew by {growth:.1} % from {}; the limit is {limit:.1} %",
+                    bytes(old)
+                )
             };
             if change.gpu_bytes > limit {
                 let message = grew("on the GPU", change.gpu_bytes, old.gpu_bytes);
@@ -214,10 +217,10 @@ impl Checked<'_> {
             match (self.figures.psnr, old.psnr) {
                 (Some(new), Some(old)) if old - new > limit => {
                     let message =
-                        format!("{new:.2} dB, the baseline is {old:.2} dB: more than {limit} dB are lost");
+                        format!("{new:.2} dB loses more than {limit} dB against the baseline's {old:.2} dB");
                     // Rounded up, so that what is typed is enough.
                     let asked = ((old - limit) * 100.0).ceil() / 100.0;
-                    let remedy = self.adaptive(&format!("psnr = {asked}"), "would");
+                    let remedy = self.adaptive(&format!("psnr = {asked}"), "use");
                     out.push(self.breach("max_psnr_loss", Some(old - new), limit, message, remedy));
                 }
                 (Some(_), Some(_)) => {}
@@ -228,7 +231,7 @@ impl Checked<'_> {
                         None,
                         limit,
                         message,
-                        "format = \"f32\" is exact".to_owned(),
+                        "use `format = \"f32\"`, which is exact".to_owned(),
                     ));
                 }
                 _ => {
@@ -244,9 +247,9 @@ impl Checked<'_> {
     fn smaller(&self, limit: f64) -> String {
         let tree = self.figures.gpu_bytes as f64 * self.figures.tree_share;
         if limit <= tree {
-            return format!("no size would meet it: tree and masks are {}", bytes(tree as u64));
+            return format!("no size meets it: tree and masks take {}", bytes(tree as u64));
         }
-        self.adaptive(&format!("size = {limit:.0}"), "should")
+        self.adaptive(&format!("size = {limit:.0}"), "try")
     }
 
     /// The same for its file, by how well this pack's texels are packed.
@@ -254,27 +257,27 @@ impl Checked<'_> {
         let stored = self.pack.stored_texel_bytes() as f64;
         let left = limit - (self.figures.file_bytes as f64 - stored);
         if left <= 0.0 {
-            return "no size would meet it: the rest of the file is tree and tables".to_owned();
+            return "no size meets it: the rest of the file is tree and tables".to_owned();
         }
         let tree = self.figures.gpu_bytes as f64 * self.figures.tree_share;
         let texels = self.figures.gpu_bytes as f64 - tree;
         self.smaller(tree + texels * left / stored.max(1.0) * (1.0 - FILE_MARGIN))
     }
 
-    /// A setting of adaptive packs, and what it does not go with.
-    fn adaptive(&self, setting: &str, would: &str) -> String {
+    /// A setting of adaptive packs, and what it does not go with: "use" where it certainly meets the limit, else "try".
+    fn adaptive(&self, setting: &str, verb: &str) -> String {
         let settings = self.settings;
         let asked = key(settings.quality).filter(|asked| !setting.starts_with(asked));
-        let format = if settings.format == Format::Adaptive { "" } else { "format = \"adaptive\" with " };
-        let mut remedy = format!("{format}{setting} {would} meet it");
+        let format = if settings.format == Format::Adaptive { "" } else { "format = \"adaptive\"` with `" };
+        let mut remedy = format!("{verb} `{format}{setting}`");
         if let Some(asked) = asked.filter(|_| settings.format == Format::Adaptive) {
-            remedy += &format!(", in place of {asked}");
+            remedy += &format!(" instead of `{asked}`");
         }
         if settings.clustering.is_some() {
-            remedy += ", without dedup";
+            remedy += ", without `dedup`";
         }
         if settings.min_frame_psnr.is_some() && !setting.starts_with("psnr") {
-            remedy += ", without min_frame_psnr";
+            remedy += ", without `min_frame_psnr`";
         }
         remedy
     }
@@ -282,7 +285,7 @@ impl Checked<'_> {
 
 const NOT_COMPARED: &str = "the pack was not compared with its source";
 const COMPARE: &str = "build with --verify voxels";
-const NO_RANGE: &str = "all active values are one, so that there is no range to measure by";
+const NO_RANGE: &str = "all active values are equal, so PSNR has no value range";
 const USE_MAX_ERROR: &str = "limit max_error, in units";
 
 /// What a manifest calls it; nothing where the manifest says nothing.
@@ -296,7 +299,7 @@ fn key(quality: Quality) -> Option<&'static str> {
     }
 }
 
-/// Every limit that all assets together are past.
+/// Every budget that all assets together exceed.
 pub fn of_total(total: &Total, packs: &[(&str, &Figures)]) -> Vec<Breach> {
     let mut out = Vec::new();
     let mut past = |budget, figure: f64, limit: f64, message, remedy| {
@@ -307,12 +310,12 @@ pub fn of_total(total: &Total, packs: &[(&str, &Figures)]) -> Vec<Breach> {
         largest.map_or_else(String::new, |(size, name)| format!("the largest is {name} with {}", bytes(size)))
     };
     if let Some(limit) = total.gpu_budget.filter(|limit| total.gpu_bytes > *limit) {
-        let message = format!("{} are over {}", bytes(total.gpu_bytes), bytes(limit));
+        let message = format!("{} exceeds the {} limit", bytes(total.gpu_bytes), bytes(limit));
         let remedy = largest(|figures| figures.gpu_bytes);
         past("gpu_size", total.gpu_bytes as f64, limit as f64, message, format!("{remedy}: give it a size"));
     }
     if let Some(limit) = total.file_budget.filter(|limit| total.file_bytes > *limit) {
-        let message = format!("{} are over {}", bytes(total.file_bytes), bytes(limit));
+        let message = format!("{} exceeds the {} limit", bytes(total.file_bytes), bytes(limit));
         let remedy = largest(|figures| figures.file_bytes);
         past(
             "file_size",
@@ -323,8 +326,8 @@ pub fn of_total(total: &Total, packs: &[(&str, &Figures)]) -> Vec<Breach> {
         );
     }
     if let Some(limit) = total.seconds_budget.filter(|limit| total.build_seconds > *limit) {
-        let message = format!("{} are over {}", seconds(total.build_seconds), seconds(limit));
-        let remedy = "a cache that machines share (--remote-cache) leaves only what changed".to_owned();
+        let message = format!("{} exceeds the {} limit", seconds(total.build_seconds), seconds(limit));
+        let remedy = "share a cache between machines (--remote-cache)".to_owned();
         past("build_seconds", total.build_seconds, limit, message, remedy);
     }
     out

@@ -9,10 +9,10 @@ use super::Format;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Dedup {
-    /// Those with the same bits
+    /// Merge identical bricks
     #[default]
     Exact,
-    /// Those that k-means puts into one cluster, as in the Utrecht thesis
+    /// Merge similar bricks by k-means, as in the Utrecht thesis
     Kmeans,
 }
 
@@ -44,20 +44,20 @@ pub const NOT_WITH_ADAPTIVE: &str = "dedup = \"kmeans\" goes with one codec for 
 /// The settings that make a [`Clustering`].
 #[derive(Args, Clone, Debug, Default, PartialEq)]
 pub struct ClusterArgs {
-    /// Which bricks are one [default: exact]
-    #[arg(long)]
+    /// How duplicate bricks are merged [default: exact]
+    #[arg(long, help_heading = "k-means")]
     pub dedup: Option<Dedup>,
-    /// With --dedup kmeans: the clusters, the thesis's k [default: 100]
-    #[arg(long, value_name = "K")]
+    /// Number of clusters, the thesis's k [default: 100]
+    #[arg(long, value_name = "K", help_heading = "k-means")]
     pub clusters: Option<u32>,
-    /// With --dedup kmeans: the iterations [default: 5]
-    #[arg(long, value_name = "N")]
+    /// Number of iterations [default: 5]
+    #[arg(long, value_name = "N", help_heading = "k-means")]
     pub iterations: Option<u32>,
-    /// With --dedup kmeans: bricks of more variance stay as they are [default: 0.01]
-    #[arg(long, value_name = "VARIANCE")]
+    /// Variance above which a brick is not merged [default: 0.01]
+    #[arg(long, value_name = "VARIANCE", help_heading = "k-means")]
     pub variance: Option<f64>,
-    /// With --dedup kmeans: the seed of the first centroids [default: 0]
-    #[arg(long)]
+    /// Seed of the first centroids [default: 0]
+    #[arg(long, help_heading = "k-means")]
     pub seed: Option<u64>,
 }
 

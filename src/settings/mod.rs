@@ -17,18 +17,18 @@ use crate::codec::Codec;
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Format {
-    /// Each brick in the cheapest codec for the quality asked
+    /// The cheapest codec for each brick at the quality asked
     #[default]
     Adaptive,
     /// 32-bit floats, lossless
     F32,
     /// 16-bit floats, exact where the source is half
     F16,
-    /// 8 bits a voxel
+    /// 8 bits per voxel
     Unorm8,
-    /// BC4 blocks, 4 bits a voxel
+    /// BC4 blocks, 4 bits per voxel
     Bc4,
-    /// BC7 blocks, 2 bits a voxel
+    /// BC7 blocks, 2 bits per voxel
     Bc7,
 }
 
@@ -61,7 +61,7 @@ pub enum RangeMode {
     /// The minimum and maximum of each brick
     #[default]
     Brick,
-    /// Those of the whole sequence, as in the Utrecht thesis
+    /// The minimum and maximum of the whole sequence, as in the Utrecht thesis
     Sequence,
 }
 
@@ -69,13 +69,13 @@ pub enum RangeMode {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Masks {
-    /// Kept for level sets, for f32 and where the background is not 0; else dropped from bricks whose
-    /// inactive voxels are background
+    /// Keep them for level sets, f32, and backgrounds other than 0; else drop them from bricks whose inactive voxels are
+    /// background
     #[default]
     Auto,
-    /// Kept everywhere
+    /// Keep them everywhere
     Keep,
-    /// Dropped from every brick whose inactive voxels are background
+    /// Drop them from every brick whose inactive voxels are background
     Drop,
 }
 
@@ -83,10 +83,10 @@ pub enum Masks {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum NonFinite {
-    /// Count them and fail the build
+    /// Fail the build and count them
     #[default]
     Refuse,
-    /// Make them 0
+    /// Replace them by 0
     Zero,
 }
 
@@ -94,12 +94,12 @@ pub enum NonFinite {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
 #[serde(rename_all = "lowercase")]
 pub enum Integers {
-    /// Rounding a decoded value gives the integer: its error is below a half
+    /// Keep every integer: the error is below 0.5, so rounding gives it back
     #[default]
     Keep,
-    /// Packed as several grids of 24 bits each (NAME.low, NAME.high) that together give every integer back exactly
+    /// Pack integers past 2^24 as several grids of 24 bits each (NAME.low, NAME.high)
     Split,
-    /// Treated as any other numbers
+    /// Treat them as floats
     Nearest,
 }
 

@@ -190,20 +190,20 @@ impl FromStr for ByteSize {
 /// The settings of which an adaptive pack has one, and its floor for single frames.
 #[derive(Args, Clone, Debug, Default, PartialEq)]
 pub struct QualityArgs {
-    /// Adaptive: the PSNR over active voxels to reach, in dB [default: 55; for level sets --max-error "0.05 voxels"]
-    #[arg(long, value_name = "DB", value_parser = decibels, group = "quality")]
+    /// Minimum PSNR over active voxels, in dB [default: 55; level sets have --max-error "0.05 voxels"]
+    #[arg(long, value_name = "DB", value_parser = decibels, group = "quality", help_heading = "Quality")]
     pub psnr: Option<f64>,
-    /// Adaptive: the error that no voxel exceeds on any GPU: 0.01 or 1% of the range, "0.2 units", "0.1 voxels"
-    #[arg(long, value_name = "ERROR", group = "quality")]
+    /// Maximum error of any voxel: 0.01 or 1% of the value range, "0.2 units" or "0.1 voxels"
+    #[arg(long, value_name = "ERROR", group = "quality", help_heading = "Quality")]
     pub max_error: Option<ErrorBound>,
-    /// Adaptive: the most GPU bits for each of the 512 voxels of a source leaf
-    #[arg(long, value_name = "BITS", value_parser = above_zero, group = "quality")]
+    /// Maximum GPU bits per voxel, counted over all 512 voxels of each leaf
+    #[arg(long, value_name = "BITS", value_parser = above_zero, group = "quality", help_heading = "Quality")]
     pub bits_per_voxel: Option<f64>,
-    /// Adaptive: the most bytes that tree, masks and texels may take on a GPU: 40MB, 512KiB
-    #[arg(long, value_name = "BYTES", group = "quality")]
+    /// Maximum size on the GPU (tree, masks and texels): 40MB, 512KiB
+    #[arg(long, value_name = "BYTES", group = "quality", help_heading = "Quality")]
     pub size: Option<ByteSize>,
-    /// Adaptive: the PSNR that no frame falls below [default: 6 dB below the whole]
-    #[arg(long, value_name = "DB", value_parser = decibels)]
+    /// Minimum PSNR of any single frame, in dB [default: 6 dB below the sequence's]
+    #[arg(long, value_name = "DB", value_parser = decibels, help_heading = "Quality")]
     pub min_frame_psnr: Option<f64>,
 }
 

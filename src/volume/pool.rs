@@ -89,7 +89,7 @@ impl BrickPool {
     }
 
     /// BLAKE3 of what makes a brick: its values, and its mask where that is kept. Two bricks of one digest are one:
-    /// nobody has ever found two texts of one.
+    /// no BLAKE3 collision is known.
     pub fn digest(brick: &Brick) -> [u8; 32] {
         let mut hasher = blake3::Hasher::new();
         hasher.update(bytemuck::bytes_of(&brick.values));
