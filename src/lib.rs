@@ -33,7 +33,7 @@
 //! # Ok::<(), volpack::error::Error>(())
 //! ```
 
-mod aside;
+mod atomic_file;
 pub mod cache;
 pub mod cli;
 pub mod codec;
@@ -42,13 +42,13 @@ pub mod interrupt;
 pub mod manifest;
 pub mod pack;
 pub mod pipeline;
+pub mod profile;
 pub mod render;
 pub mod report;
 pub mod sequence;
 pub mod settings;
 pub mod stages;
 pub mod sweep;
-pub mod trace;
 pub mod units;
 pub mod vdb;
 pub mod verify;

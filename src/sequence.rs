@@ -270,7 +270,7 @@ struct Run {
 
 /// A number in names of one shape.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-struct Field {
+struct DecodedFrame {
     run: usize,
     part: usize,
     /// Whether the next part is its fraction, in the names that have one.
@@ -293,14 +293,14 @@ enum Look {
 /// Which number of some names is the frame's.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Choice {
-    Frame(Field),
+    Frame(DecodedFrame),
     /// A version or resolution, where nothing else differs.
-    Version(Field),
+    Version(DecodedFrame),
     None,
 }
 
 impl Choice {
-    fn field(self) -> Option<Field> {
+    fn field(self) -> Option<DecodedFrame> {
         match self {
             Self::Frame(field) | Self::Version(field) => Some(field),
             Self::None => None,
@@ -332,7 +332,7 @@ impl Name {
     }
 
     /// Where a field lies, with its sign and its fraction.
-    fn span(&self, field: &Field) -> Range<usize> {
+    fn span(&self, field: &DecodedFrame) -> Range<usize> {
         let run = &self.runs[field.run];
         let start = if field.part == 0 { run.start } else { run.parts[field.part].start };
         let last = (field.part + usize::from(field.has_fraction)).min(run.parts.len() - 1);
@@ -340,19 +340,19 @@ impl Name {
     }
 
     /// What is before and behind a field.
-    fn rest(&self, field: &Field) -> (&str, &str) {
+    fn rest(&self, field: &DecodedFrame) -> (&str, &str) {
         let span = self.span(field);
         (&self.stem[..span.start], &self.stem[span.end..])
     }
 
-    fn time(&self, field: &Field) -> Option<Time> {
+    fn time(&self, field: &DecodedFrame) -> Option<Time> {
         let run = &self.runs[field.run];
         let is_negative = field.part == 0 && run.start < run.parts[0].start;
         let fraction = field.has_fraction.then(|| self.part(field.run, field.part + 1)).flatten();
         Time::parse(is_negative, self.part(field.run, field.part)?, fraction.unwrap_or_default())
     }
 
-    fn look(&self, field: &Field) -> Look {
+    fn look(&self, field: &DecodedFrame) -> Look {
         let span = self.span(field);
         let (before, behind) = (&self.stem[..span.start], &self.stem[span.end..]);
         let word = before.rsplit(|c: char| !c.is_alphabetic()).next().unwrap_or_default();
@@ -442,8 +442,8 @@ fn part_counts(names: &[&Name], run: usize) -> (usize, usize) {
 
 /// Whether the part behind part `part` of a run is that part's fraction in names of one shape.
 fn is_fraction(names: &[&Name], run: usize, part: usize) -> bool {
-    let time = Field { run, part, has_fraction: true };
-    let whole = Field { has_fraction: false, ..time };
+    let time = DecodedFrame { run, part, has_fraction: true };
+    let whole = DecodedFrame { has_fraction: false, ..time };
     if names[0].look(&whole) == Look::Version {
         return false;
     }
@@ -498,14 +498,14 @@ fn is_padded(digits: &str) -> bool {
 }
 
 /// The numbers in names of one shape.
-fn fields(names: &[&Name]) -> Vec<Field> {
+fn fields(names: &[&Name]) -> Vec<DecodedFrame> {
     let mut fields = Vec::new();
     for run in 0..names[0].runs.len() {
         let (least, most) = part_counts(names, run);
         let mut part = 0;
         while part < least {
             let has_fraction = part + 1 < most && is_fraction(names, run, part);
-            fields.push(Field { run, part, has_fraction });
+            fields.push(DecodedFrame { run, part, has_fraction });
             part += 1 + usize::from(has_fraction);
         }
     }

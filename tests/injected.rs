@@ -163,12 +163,12 @@ fn wrong_inactive_rules_and_masks_are_found() {
 fn an_error_norm_that_is_no_number_passes_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let victim = Victim::new("fog_half_zip.vdb", "density", Format::Bc7, folder.path());
-    for norm in [f64::NAN, f64::INFINITY, 0.0] {
+    for error_l2 in [f64::NAN, f64::INFINITY, 0.0] {
         let found = victim.verdict(|bytes| {
-            let at = Victim::section(bytes, kind::FRAMES) + offset_of!(FrameRecord, error_norm);
-            bytes[at..at + 8].copy_from_slice(&norm.to_le_bytes());
+            let at = Victim::section(bytes, kind::FRAMES) + offset_of!(FrameRecord, error_l2);
+            bytes[at..at + 8].copy_from_slice(&error_l2.to_le_bytes());
         });
-        assert!(found.is_some_and(|found| found.contains("the encoder left")), "{norm}");
+        assert!(found.is_some_and(|found| found.contains("the encoder left")), "{error_l2}");
     }
 }
 
@@ -192,7 +192,7 @@ fn tables_that_say_another_thing_are_found() {
     assert!(fps.is_some_and(|found| found.contains("frames per second")), "a wrong frame rate");
     let least = grid(offset_of!(GridRecord, active_min), (-1f32).to_le_bytes());
     assert!(least.is_some_and(|found| found.contains("active values")), "a wrong range");
-    let cost = grid(offset_of!(GridRecord, codec_norms) + 4 * Codec::Unorm8 as usize, 0f32.to_le_bytes());
+    let cost = grid(offset_of!(GridRecord, codec_error_l2s) + 4 * Codec::Unorm8 as usize, 0f32.to_le_bytes());
     assert!(cost.is_some_and(|found| found.contains("unorm8")), "a wrong cost");
     let number = changed(kind::FRAMES, offset_of!(FrameRecord, number), 0i32.to_le_bytes());
     assert!(number.is_some_and(|found| found.contains("frame 0")), "a wrong number");

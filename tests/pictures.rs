@@ -11,7 +11,7 @@ use vdb_writer::{GridFile, write_grid};
 use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::render::{
-    Device, Field, Image, Interpolation, Mode, Scene, View, apart, spread, trace, trace_noting_bc4,
+    DecodedFrame, Device, Image, Interpolation, Mode, Scene, View, apart, spread, trace, trace_noting_bc4,
 };
 use volpack::settings::{Format, Quality, Settings};
 use volpack::verify::{PictureSettings, PicturesReport, Sources, pictures, shown_frames};
@@ -56,8 +56,8 @@ fn ring(pack: &Pack, frames: &[PathBuf]) -> PicturesReport {
     pictures(pack, &Sources::find(pack, frames).unwrap(), &settings).unwrap()
 }
 
-fn field(pack: &Pack, frame: usize) -> Field {
-    Field::from_pack(&pack.frame(0, frame).unwrap()).unwrap()
+fn field(pack: &Pack, frame: usize) -> DecodedFrame {
+    DecodedFrame::from_pack(&pack.frame(0, frame).unwrap()).unwrap()
 }
 
 /// Middle and size of what a picture shows, in pixels, and the sum of its opacity.
@@ -224,7 +224,7 @@ fn what_rounding_decides_is_told_from_what_is_wrong() {
         |[x, y, z]: [i32; 3]| [x, y, z].iter().map(|v| (*v as f32 - 11.3).powi(2)).sum::<f32>().sqrt() - 8.0;
     let frames = write(folder.path(), &[level_set(obstacle), level_set(ball)]);
     let pack = built(&frames, settings(Format::F32), folder.path());
-    let unexplained = |f: usize, other: &dyn Fn(&Field, &Scene) -> Image| {
+    let unexplained = |f: usize, other: &dyn Fn(&DecodedFrame, &Scene) -> Image| {
         let field = field(&pack, f);
         let scene = Scene::new(&pack.grids[0], f, &View::default(), Mode::Lit, [256; 2]);
         let (ours, other) = (trace::<f32>(&field, &scene).unwrap(), other(&field, &scene));
@@ -235,10 +235,10 @@ fn what_rounding_decides_is_told_from_what_is_wrong() {
             far.iter().zip(spread).filter(|&(&pixel, spread)| apart(pixel) > 1e-5 + 2.0 * spread).count();
         [far.len(), unexplained]
     };
-    let exact = |field: &Field, scene: &Scene| trace::<f64>(field, scene).unwrap();
+    let exact = |field: &DecodedFrame, scene: &Scene| trace::<f64>(field, scene).unwrap();
     let [far, wrong] = unexplained(0, &exact);
     assert!(far > 65 && wrong <= 6, "{far} pixels differ, {wrong} without a reason");
-    let elsewhere = |field: &Field, scene: &Scene| {
+    let elsewhere = |field: &DecodedFrame, scene: &Scene| {
         let moved = scene.matrix.iter().enumerate().map(|(i, v)| if i == 12 { v + 0.02 } else { *v });
         let matrix: Vec<f64> = moved.collect();
         trace::<f32>(field, &Scene { matrix: matrix.try_into().unwrap(), ..*scene }).unwrap()

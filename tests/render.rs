@@ -12,8 +12,8 @@ use volpack::pack::Pack;
 use volpack::pack::layout::{Section, kind};
 use volpack::pipeline::build_altered;
 use volpack::render::{
-    Camera, Device, Field, Image, Interpolation, Mode, Renderer, Scene, Traversal, View, WorldBox, apart,
-    difference, trace, trace_noting_bc4, write_png,
+    Camera, DecodedFrame, Device, Image, Interpolation, Mode, Renderer, Scene, Traversal, View, WorldBox,
+    apart, difference, trace, trace_noting_bc4, write_png,
 };
 use volpack::settings::{Format, Settings};
 use volpack::volume::{Cell, CellContent, Child, Constant, Coord, CoordBox, FlatFrame, ValueRange};
@@ -22,7 +22,7 @@ const SIZE: [u32; 2] = [72, 56];
 
 fn scene(
     pack: &Pack,
-    field: &Field,
+    field: &DecodedFrame,
     mode: Mode,
     traversal: Traversal,
     interpolation: Interpolation,
@@ -87,7 +87,7 @@ fn hdda_and_dda_see_the_same() {
     for (name, frames, grid) in cases() {
         let settings = Settings { grids: vec![grid.to_owned()], format: Format::F32, ..Settings::default() };
         let (pack, _) = build_verified(&frames, settings, folder.path());
-        let field = Field::from_pack(&pack.frame(0, 0).unwrap()).unwrap();
+        let field = DecodedFrame::from_pack(&pack.frame(0, 0).unwrap()).unwrap();
         // A box of thousands of voxels takes a DDA too long.
         if VAST.contains(&name) {
             continue;
@@ -128,7 +128,7 @@ fn the_shader_sees_what_the_cpu_sees() {
             let uploaded = gpu.upload(&pack).unwrap();
             let frame = pack.grids[0].frames.len() - 1;
             let reader = pack.frame(0, frame).unwrap();
-            let field = Field::from_pack(&reader).unwrap();
+            let field = DecodedFrame::from_pack(&reader).unwrap();
             assert_eq!(reader.bounds(), field.bounds);
             for (mode, interpolation) in modes(&pack) {
                 for traversal in [Traversal::Dda, Traversal::Hdda] {
@@ -213,7 +213,7 @@ fn the_gpu_decodes_any_bc7_block_as_the_cpu_does() {
     reseal::reseal(&mut bytes);
     let pack = Pack::from_bytes(bytes).unwrap();
     let uploaded = gpu.upload(&pack).unwrap();
-    let field = Field::from_pack(&pack.frame(0, 0).unwrap()).unwrap();
+    let field = DecodedFrame::from_pack(&pack.frame(0, 0).unwrap()).unwrap();
     for mode in [Mode::Density, Mode::First] {
         for view in ["orbit:40,20,0.8", "orbit:200,-35,0.8"] {
             let scene = Scene::new(&pack.grids[0], 0, &view.parse().unwrap(), mode, [160, 160]);
@@ -252,7 +252,7 @@ fn a_large_node_s_neighbours_are_seen_brick_by_brick() {
     build_altered(&job, &chessboard, &mut volpack::pipeline::Silent).unwrap();
     let pack = Pack::open(&job.output).unwrap();
     let reader = pack.frame(0, 0).unwrap();
-    let field = Field::from_pack(&reader).unwrap();
+    let field = DecodedFrame::from_pack(&reader).unwrap();
     let mut scene = scene(&pack, &field, Mode::Depth, Traversal::Hdda, Interpolation::Trilinear);
     // Along the last layer of the positive node, where every cell reaches into the chessboard.
     let world = |[x, y, z]: [f64; 3]| {

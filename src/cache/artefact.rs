@@ -4,7 +4,7 @@ use bincode::config::{self, Config};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-/// Bytes that a result may have: the outline of a frame of six million bricks. Larger things are files.
+/// Bytes that a result may have: the frame index of a frame of six million bricks. Larger things are files.
 pub(super) const MOST: usize = 1 << 30;
 
 fn config() -> impl Config {

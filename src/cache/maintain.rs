@@ -11,7 +11,7 @@ use serde::Serialize;
 
 use super::Cache;
 use super::store::{ASIDE, Entry, Map, STAMPS};
-use crate::aside::{LEFT_BEHIND, is_temporary};
+use crate::atomic_file::{LEFT_BEHIND, is_temporary};
 
 /// What is in a store.
 #[derive(Clone, Debug, Default, Serialize)]

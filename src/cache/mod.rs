@@ -12,13 +12,13 @@
 //! A cache never fails a build. What goes wrong is a warning.
 
 mod artefact;
+mod file_stamps;
 mod files;
 mod key;
 mod maintain;
 pub mod remote;
-mod stamps;
+mod remote_sync;
 mod store;
-mod tiers;
 mod writer;
 
 use std::collections::{BTreeMap, HashSet};
@@ -31,9 +31,9 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 pub use artefact::pods;
+pub use file_stamps::Stamp;
 pub use key::{Key, Stage};
 pub use maintain::{Damage, Stats};
-pub use stamps::Stamp;
 
 use remote::Remote;
 use store::{Entry, Map, Store};

@@ -250,7 +250,7 @@ impl Store {
         fill(file.as_file_mut())?;
         file.as_file().sync_all()?;
         // Others may share the store.
-        crate::aside::make_readable(file.as_file())?;
+        crate::atomic_file::make_readable(file.as_file())?;
         file.persist(path).map(drop).map_err(|e| e.error)
     }
 }

@@ -11,7 +11,7 @@ use super::store::{Map, Store};
 
 /// Entries that may wait, so that a slow disk slows the build before it fills memory: these many of that many bytes.
 const WAITING: usize = 64;
-/// Larger ones, such as the outlines of very large frames, are waited for.
+/// Larger ones, such as the frame indices of very large frames, are waited for.
 const LARGE: usize = 4 << 20;
 /// Entries that are written at a time. They wait for the disk, not for a core, and a journal syncs many at once.
 const THREADS: usize = 2;

@@ -15,7 +15,7 @@ use crate::pipeline::{Job, Made, Outcome, VerifyLevel, build};
 use crate::report::model::{Figures, Total};
 use crate::report::{Breach, Checked, of_total};
 use crate::settings::Budget;
-use crate::{trace, units};
+use crate::{profile, units};
 
 const EXAMPLES: &str = "\
 Examples:
@@ -35,14 +35,14 @@ pub struct BuildArgs {
     json: bool,
     /// Write a profile of all threads, for chrome://tracing or ui.perfetto.dev
     #[arg(long, value_name = "FILE.json", help_heading = "Output")]
-    trace: Option<PathBuf>,
+    profile: Option<PathBuf>,
 }
 
 pub fn run(args: &BuildArgs, common: Common) -> Result<()> {
     let mut assets = Vec::new();
     let mut failure = None;
-    if args.trace.is_some() {
-        trace::record();
+    if args.profile.is_some() {
+        profile::record();
     }
     let cache = args.jobs.open_cache();
     let (all, limits) = args.jobs.budgets()?;
@@ -74,7 +74,7 @@ pub fn run(args: &BuildArgs, common: Common) -> Result<()> {
     if let Some(cache) = cache.filter(|_| !matches!(failure, Some(Error::Interrupted))) {
         super::cache::finish(&cache, common.quiet || args.json)?;
     }
-    args.trace.as_deref().map_or(Ok(()), trace::write)?;
+    args.profile.as_deref().map_or(Ok(()), profile::write)?;
     let packs: Vec<(&str, &Figures)> = built.iter().map(|(name, figures)| (&**name, figures)).collect();
     breaches.extend(of_total(&Total::new(&packs, &all), &packs));
     if args.json {

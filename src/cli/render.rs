@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 
 use super::{Common, outln, style};
-use crate::aside;
+use crate::atomic_file;
 use crate::error::{Error, Result};
 use crate::pack::Pack;
 use crate::render::gpu::GpuError;
@@ -124,7 +124,7 @@ fn frames(args: &RenderArgs, pack: &Pack, grid: usize) -> Result<Vec<usize>> {
 
 fn write(args: &RenderArgs, pictures: &[Vec<u8>], fps: f32) -> Result<()> {
     let failed = || Error::io(&args.output);
-    let file = aside::beside(&args.output)?;
+    let file = atomic_file::beside(&args.output)?;
     let out = BufWriter::new(file.as_file());
     match pictures {
         [one] => write_png(out, args.size, one).map_err(failed())?,
@@ -137,7 +137,7 @@ fn write(args: &RenderArgs, pictures: &[Vec<u8>], fps: f32) -> Result<()> {
             write_png(out, size, &sheet).map_err(failed())?;
         }
     }
-    aside::persist(file, &args.output)
+    atomic_file::persist(file, &args.output)
 }
 
 /// Frames left to right and top to bottom, in a sheet about as wide as it is high.

@@ -10,7 +10,7 @@ use super::jobs::{assets, stem};
 use super::progress::Reporter;
 use super::style::{ERROR, GOOD, TITLE};
 use super::{Common, outln};
-use crate::aside;
+use crate::atomic_file;
 use crate::cache::Cache;
 use crate::error::{Error, Result};
 use crate::manifest::{DEFAULT_NAME, expand};
@@ -277,16 +277,16 @@ impl Gathering<'_> {
         if let Some(path) = &args.json {
             let mut json = serde_json::to_string_pretty(&report).map_err(|e| other(&e))?;
             json.push('\n');
-            aside::write(path, json.as_bytes())?;
+            atomic_file::write(path, json.as_bytes())?;
         }
         if let Some(path) = &args.markdown {
-            aside::write(path, markdown(&report).map_err(|e| other(&e))?.as_bytes())?;
+            atomic_file::write(path, markdown(&report).map_err(|e| other(&e))?.as_bytes())?;
         }
         if let Some(path) = &args.junit {
-            aside::write(path, junit(&report).map_err(|e| other(&e))?.as_bytes())?;
+            atomic_file::write(path, junit(&report).map_err(|e| other(&e))?.as_bytes())?;
         }
         if let Some(path) = &args.html {
-            aside::write(path, html(&report, &self.galleries).map_err(|e| other(&e))?.as_bytes())?;
+            atomic_file::write(path, html(&report, &self.galleries).map_err(|e| other(&e))?.as_bytes())?;
         }
         if let Some(cache) = &self.cache {
             super::cache::finish(cache, self.common.quiet)?;

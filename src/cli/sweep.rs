@@ -9,7 +9,7 @@ use serde_json::json;
 use super::progress::Reporter;
 use super::style::{TITLE, WARNING};
 use super::{Common, outln};
-use crate::aside;
+use crate::atomic_file;
 use crate::error::{Error, Result};
 use crate::manifest::expand;
 use crate::report::chart::{Point, Spread, stability_svg, sweep_svg};
@@ -107,10 +107,10 @@ fn write_sweep(options: &Options, sweep: &Sweep, folder: &Path) -> Result<Vec<St
         _ => cores(),
     };
     let svg = sweep_svg(&options.name, &subtitle, &sweep.points).map_err(|e| Error::Other(e.to_string()))?;
-    aside::write(&folder.join("sweep.svg"), svg.as_bytes())?;
+    atomic_file::write(&folder.join("sweep.svg"), svg.as_bytes())?;
     let json = json!({ "volpack": env!("CARGO_PKG_VERSION"), "volume": options.name, "frames": options.frames.len(),
         "machine": cores(), "device": sweep.device, "trace": options.trace, "points": rows, "skipped": sweep.skipped });
-    aside::write(
+    atomic_file::write(
         &folder.join("sweep.json"),
         &serde_json::to_vec_pretty(&json).expect("figures are numbers"),
     )?;
@@ -169,10 +169,10 @@ fn write_sweep(options: &Options, sweep: &Sweep, folder: &Path) -> Result<Vec<St
 fn write_stability(options: &Options, found: &Stability, folder: &Path) -> Result<Vec<String>> {
     let svg = stability_svg(&options.name, "On 1, 2 and 3 threads", &found.spreads)
         .map_err(|e| Error::Other(e.to_string()))?;
-    aside::write(&folder.join("stability.svg"), svg.as_bytes())?;
+    atomic_file::write(&folder.join("stability.svg"), svg.as_bytes())?;
     let json = json!({ "volpack": env!("CARGO_PKG_VERSION"), "volume": options.name, "frames": options.frames.len(),
         "spreads": found.spreads, "skipped": found.skipped });
-    aside::write(
+    atomic_file::write(
         &folder.join("stability.json"),
         &serde_json::to_vec_pretty(&json).expect("figures are numbers"),
     )?;

@@ -23,7 +23,7 @@ pub(super) fn encode(sequence: &SequenceRange, batch: &[Texels]) -> Vec<u8> {
     let mut out = Vec::with_capacity(batch.len() * BRICK_VOXELS / TEXELS * BLOCK);
     for brick in batch {
         let codes = sequence.normalise(brick.range, &brick.values).map(|fraction| fraction * 255.0);
-        let weights = brick.carried.weights();
+        let weights = brick.texel_mask.weights();
         let (codes, weights) = (texel_order(&codes), texel_order(&weights));
         for block in 0..BRICK_VOXELS / TEXELS {
             let (z, by, bx) = (block / 4, block / 2 % 2, block % 2);
@@ -48,9 +48,9 @@ struct Block {
 
 impl Block {
     fn encode(&self) -> [u8; BLOCK] {
-        let carried = || (0..TEXELS).filter(|&t| self.weights[t] > 0.0).map(|t| self.codes[t]);
-        let low = carried().fold(f32::INFINITY, f32::min);
-        let high = carried().fold(f32::NEG_INFINITY, f32::max);
+        let counted = || (0..TEXELS).filter(|&t| self.weights[t] > 0.0).map(|t| self.codes[t]);
+        let low = counted().fold(f32::INFINITY, f32::min);
+        let high = counted().fold(f32::NEG_INFINITY, f32::max);
         if low > high {
             return [0; BLOCK];
         }
@@ -185,7 +185,7 @@ mod tests {
                 values: std::array::from_fn(|i| {
                     if i % (seed + 1) == 0 { noise(seed)(i) } else { (seed % 2) as f32 }
                 }),
-                carried: Mask512::ALL,
+                texel_mask: Mask512::ALL,
                 range: BrickRange::SEQUENCE,
             })
             .collect();

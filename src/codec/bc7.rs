@@ -33,7 +33,7 @@ pub(super) fn encode(sequence: &SequenceRange, batch: &[Texels]) -> Encoded {
     let mut out = Encoded { bytes: Vec::with_capacity(batch.len() * BRICK), axes: Vec::new() };
     for (i, (brick, fractions)) in batch.iter().zip(&fractions).enumerate() {
         let bytes = |axis: u8| &by_axis[usize::from(axis)][i * BRICK..][..BRICK];
-        let counts = brick.carried.weights();
+        let counts = brick.texel_mask.weights();
         let error = |axis: u8| {
             let mut decoded = [0f32; BRICK_VOXELS];
             decode(bytes(axis), axis, &mut decoded);

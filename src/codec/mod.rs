@@ -98,21 +98,21 @@ pub struct Texels {
     /// are free, and are chosen to be easy on the encoder.
     pub values: [f32; BRICK_VOXELS],
     /// The voxels whose texel counts: errors elsewhere are never seen.
-    pub carried: Mask512,
+    pub texel_mask: Mask512,
     /// What a normalised texel's 0 and 1 stand for.
     pub range: BrickRange,
 }
 
 impl Texels {
-    /// Prepares a brick. `carried` are the voxels that its texels give; `min` and `max` the range of
+    /// Prepares a brick. `texel_mask` are the voxels that its texels give; `min` and `max` the range of
     /// those. The others are clamped to that range: for the inactive voxels of a level set that
     /// continues the band smoothly, and it never stretches the range.
-    pub fn new(brick: &Brick, carried: Mask512, (min, max): (f32, f32), range: BrickRange) -> Self {
+    pub fn new(brick: &Brick, texel_mask: Mask512, (min, max): (f32, f32), range: BrickRange) -> Self {
         let mut values = brick.values;
-        if carried != Mask512::ALL {
+        if texel_mask != Mask512::ALL {
             values.iter_mut().for_each(|v| *v = v.clamp(min, max));
         }
-        Self { values, carried, range }
+        Self { values, texel_mask, range }
     }
 }
 

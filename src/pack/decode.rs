@@ -263,14 +263,14 @@ impl FrameReader<'_> {
             return Ok(DecodedBrick { values, active });
         };
         let active = self.mask(index);
-        let minus = match record.rule {
+        let sign_mask = match record.rule {
             InactiveRule::Texel => return Ok(DecodedBrick { values, active }),
             InactiveRule::Background => Mask512::NONE,
             InactiveRule::MinusBackground => Mask512::ALL,
             InactiveRule::Sign => self.mask(index + 1),
         };
         for i in (0..BRICK_VOXELS).filter(|&i| !active.get(i)) {
-            values[i] = if minus.get(i) { -background } else { background };
+            values[i] = if sign_mask.get(i) { -background } else { background };
         }
         Ok(DecodedBrick { values, active })
     }

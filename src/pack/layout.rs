@@ -171,7 +171,7 @@ pub struct GridRecord {
     pub active_max: f32,
     /// What each codec cost, by tag: the root of the sum of squared errors over every voxel of its
     /// bricks that no rule gives, over all frames.
-    pub codec_norms: [f32; 6],
+    pub codec_error_l2s: [f32; 6],
 }
 
 /// One frame of one grid.
@@ -194,7 +194,7 @@ pub struct FrameRecord {
     pub reserved: u32,
     /// What encoding cost: the root of the sum of squared errors over every voxel of the frame's bricks that no
     /// rule gives, and of bricks that became background.
-    pub error_norm: f64,
+    pub error_l2: f64,
     /// Leaves of the source's tree.
     pub leaves: u64,
     /// Active voxels of the source, tiles in full.

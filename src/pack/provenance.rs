@@ -81,7 +81,7 @@ impl ProvenanceError {
 /// What every version of volpack writes, whatever its settings are.
 #[derive(Deserialize)]
 #[allow(dead_code)] // Read to see that it is there.
-struct Outline {
+struct AnyProvenance {
     tool: String,
     version: String,
     settings: IgnoredAny,
@@ -103,8 +103,8 @@ impl Provenance {
     /// # Errors
     /// [`ProvenanceError::UnknownSetting`] and [`ProvenanceError::Malformed`].
     pub fn from_json(json: &[u8]) -> Result<Self, ProvenanceError> {
-        serde_json::from_slice(json).map_err(|error| match serde_json::from_slice::<Outline>(json) {
-            Ok(Outline { tool, version, .. }) => {
+        serde_json::from_slice(json).map_err(|error| match serde_json::from_slice::<AnyProvenance>(json) {
+            Ok(AnyProvenance { tool, version, .. }) => {
                 ProvenanceError::UnknownSetting { tool, version, setting: unknown_setting(&error) }
             }
             Err(error) => ProvenanceError::Malformed(error.to_string()),

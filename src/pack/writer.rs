@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 use tempfile::NamedTempFile;
 
-use crate::aside::{LEFT_BEHIND, folder_of, is_temporary, make_readable};
+use crate::atomic_file::{LEFT_BEHIND, folder_of, is_temporary, make_readable};
 
 use super::layout::{ALIGNMENT, Chunk, Header, MAGIC, Section, VERSION, encoding};
 
@@ -131,7 +131,7 @@ impl PackWriter {
     /// # Errors
     /// When the file cannot be written.
     pub fn chunk(&mut self, chunk: &StoredChunk) -> io::Result<()> {
-        let _span = crate::trace::span("write");
+        let _span = crate::profile::span("write");
         self.out.write_all(&chunk.bytes)?;
         let stored = chunk.bytes.len() as u32;
         self.chunks.push(Chunk {
@@ -231,7 +231,7 @@ impl PackWriter {
         self.out.write_all(bytemuck::cast_slice(&self.sections))?;
         self.out.write_all(bytemuck::cast_slice(&self.chunks))?;
         let file = self.out.into_inner().map_err(io::IntoInnerError::into_error)?;
-        let _span = crate::trace::span("sync");
+        let _span = crate::profile::span("sync");
         file.as_file().sync_all()?;
         make_readable(file.as_file())?;
         Ok(FinishedPack { file, path: self.path })

@@ -7,14 +7,14 @@ use rayon::prelude::*;
 use super::{Job, Plan, Progress, memory};
 use crate::cache::{Cache, Key, Stage};
 use crate::error::{Error, Result};
+use crate::profile;
 use crate::settings::{Format, Masks, Settings};
-use crate::stages::dedup::{DedupError, Fetch, MaskPolicy, Outline, SequenceTree};
+use crate::stages::dedup::{DedupError, Fetch, FrameIndex, MaskPolicy, SequenceTree};
 use crate::stages::encodings::GridCache;
 use crate::stages::flatten::{Flattened, flatten};
 use crate::stages::metadata::{FrameSource, SequenceInfo};
 use crate::stages::select::{SelectedGrid, Selection, find};
 use crate::stages::serialise::{FrameInput, GridInput};
-use crate::trace;
 use crate::vdb::{GridClass, VdbFile};
 use crate::volume::{Blocks, Brick, FlatFrame};
 
@@ -24,7 +24,7 @@ pub type Alter<'a> = &'a (dyn Fn(&mut FlatFrame) + Sync);
 const OUTLINE: Stage = Stage { name: "outline", version: 4, travels: false };
 
 /// One grid of one frame, with its voxels unless they were not needed so far.
-type Frame = (Outline, Option<Blocks<Brick>>);
+type Frame = (FrameIndex, Option<Blocks<Brick>>);
 
 /// Reads frames and adds them in order: while some are added the next are read, as many as memory
 /// has room for.
@@ -85,11 +85,11 @@ fn add(
     sources: &[FrameSource],
     frames: Vec<Result<Vec<Option<Frame>>>>,
 ) -> Result<()> {
-    let _span = trace::span("dedup");
+    let _span = profile::span("dedup");
     for (source, frame) in sources.iter().zip(frames) {
         for (grid, frame) in grids.iter_mut().zip(frame?) {
-            let Some((outline, voxels)) = frame else { continue };
-            grid.tree.add(outline, voxels).map_err(|e| match e {
+            let Some((frame_index, voxels)) = frame else { continue };
+            grid.tree.add(frame_index, voxels).map_err(|e| match e {
                 DedupError::Scratch { source } => Error::io(grid.tree.scratch.path())(source),
                 DedupError::Background { .. } => Error::Input(format!(
                     "{}: grid {:?}: {e}: export the whole sequence with one background",
@@ -114,29 +114,29 @@ fn read_frame(
     let mut read = Vec::new();
     let one = |grid: &SelectedGrid| -> Result<Option<Frame>> {
         let Some(key) = key(frame, grid, settings) else { return Ok(None) };
-        let known = cache.and_then(|cache| cache.get::<Outline>(&key)).filter(Outline::is_sound);
-        if let Some(outline) = known {
-            return Ok(Some((outline, None)));
+        let known = cache.and_then(|cache| cache.get::<FrameIndex>(&key)).filter(FrameIndex::is_sound);
+        if let Some(frame_index) = known {
+            return Ok(Some((frame_index, None)));
         }
         let file = match &file {
             Some(file) => file,
             None => file.insert(VdbFile::open(&frame.path).map_err(Error::vdb(&frame.path))?),
         };
-        let span = trace::span("flatten");
+        let span = profile::span("flatten");
         let mut flat = flatten_grid(file, frame, grid, settings)?;
         if let Some(alter) = alter {
             alter(&mut flat.frame);
         }
-        let (outline, voxels) = Outline::split(flat, mask_policy(settings, grid.class));
+        let (frame_index, voxels) = FrameIndex::split(flat, mask_policy(settings, grid.class));
         drop(span);
         read.push(key);
-        Ok(Some((outline, Some(voxels))))
+        Ok(Some((frame_index, Some(voxels))))
     };
     let frames = selection.grids.iter().map(one).collect::<Result<Vec<_>>>()?;
     if let Some(cache) = cache.filter(|_| !read.is_empty()) {
         frame.check_unchanged()?;
-        let outlines = frames.iter().flatten().filter(|(_, voxels)| voxels.is_some());
-        read.iter().zip(outlines).for_each(|(key, (outline, _))| cache.put(key, outline));
+        let frame_indices = frames.iter().flatten().filter(|(_, voxels)| voxels.is_some());
+        read.iter().zip(frame_indices).for_each(|(key, (frame_index, _))| cache.put(key, frame_index));
     }
     Ok(frames)
 }
@@ -155,7 +155,7 @@ fn flatten_grid(
     flatten(file, &frame.path, info, grid.component, settings.nonfinite)
 }
 
-/// Reads the voxels of a grid's frames once more, for those whose outline alone is known.
+/// Reads the voxels of a grid's frames once more, for those whose frame index alone is known.
 fn fetch(sequence: &SequenceInfo, grid: &SelectedGrid, settings: &Settings, at_once: usize) -> Fetch {
     let frames: Vec<FrameSource> = grid.frames.iter().map(|&i| sequence.frames[i].clone()).collect();
     let (grid, settings) = (grid.clone(), settings.clone());
@@ -169,7 +169,7 @@ fn fetch(sequence: &SequenceInfo, grid: &SelectedGrid, settings: &Settings, at_o
     Fetch { read: Box::new(read), at_once }
 }
 
-/// What the outline of one grid of one frame depends on; `None` if the frame lacks the grid.
+/// What the frame index of one grid of one frame depends on; `None` if the frame lacks the grid.
 fn key(frame: &FrameSource, grid: &SelectedGrid, settings: &Settings) -> Option<Key> {
     let info = find(&frame.grids, &grid.source)?;
     let policy = mask_policy(settings, grid.class);

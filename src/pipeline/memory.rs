@@ -22,7 +22,7 @@ const PROGRAM: u64 = 12 << 20;
 const OF_A_THREAD: u64 = 4 << 20;
 /// What is kept of each leaf of a sequence while it is built. Measured: 75 (docs/decisions/0012-scale.md).
 const OF_A_LEAF: u64 = 96;
-/// What there is of a leaf of a frame beside its values: its part of an outline, or what a comparison found.
+/// What there is of a leaf of a frame beside its values: its part of a frame index, or what a comparison found.
 const BESIDE_VALUES: u64 = 512;
 
 /// How many frames of a plan may be in memory together; twice the threads where nothing is said.

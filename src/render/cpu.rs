@@ -6,7 +6,7 @@
 use rayon::prelude::*;
 
 use super::camera::{Camera, Lens, View, WorldBox, apply3, dot, invert3, length, normalise};
-use super::field::{Content, Field};
+use super::decoded_frame::{Content, DecodedFrame};
 use super::image::{Image, apart, opacity};
 use super::surface::{cubic, evaluate, first_change};
 use super::traverse::{Box3, MAX_CELL, Ray, Real, Walk};
@@ -144,7 +144,7 @@ impl Setup {
 ///
 /// # Errors
 /// [`TraceError`].
-pub fn trace<F: Real>(field: &Field, scene: &Scene) -> Result<Image, TraceError> {
+pub fn trace<F: Real>(field: &DecodedFrame, scene: &Scene) -> Result<Image, TraceError> {
     Ok(trace_noting_bc4::<F>(field, scene)?.0)
 }
 
@@ -152,7 +152,10 @@ pub fn trace<F: Real>(field: &Field, scene: &Scene) -> Result<Image, TraceError>
 ///
 /// # Errors
 /// [`TraceError`].
-pub fn trace_noting_bc4<F: Real>(field: &Field, scene: &Scene) -> Result<(Image, Vec<bool>), TraceError> {
+pub fn trace_noting_bc4<F: Real>(
+    field: &DecodedFrame,
+    scene: &Scene,
+) -> Result<(Image, Vec<bool>), TraceError> {
     let setup = Setup::new(scene, field.bounds)?;
     let tracer = Tracer::<F>::new(field, scene, &setup);
     let [width, height] = scene.size;
@@ -167,7 +170,7 @@ pub fn trace_noting_bc4<F: Real>(field: &Field, scene: &Scene) -> Result<(Image,
 ///
 /// # Errors
 /// [`TraceError`].
-pub fn spread(field: &Field, scene: &Scene, pixels: &[usize]) -> Result<Vec<f32>, TraceError> {
+pub fn spread(field: &DecodedFrame, scene: &Scene, pixels: &[usize]) -> Result<Vec<f32>, TraceError> {
     let setup = Setup::new(scene, field.bounds)?;
     let tracer = Tracer::<f32>::new(field, scene, &setup);
     let width = scene.size[0] as usize;
@@ -185,7 +188,7 @@ pub fn spread(field: &Field, scene: &Scene, pixels: &[usize]) -> Result<Vec<f32>
 ///
 /// # Errors
 /// [`TraceError`].
-pub fn optical_depths<F: Real>(field: &Field, scene: &Scene) -> Result<Vec<f32>, TraceError> {
+pub fn optical_depths<F: Real>(field: &DecodedFrame, scene: &Scene) -> Result<Vec<f32>, TraceError> {
     let setup = Setup::new(scene, field.bounds)?;
     let tracer = Tracer::<F> { extinction: F::from_i32(1), ..Tracer::new(field, scene, &setup) };
     let [width, height] = scene.size;
@@ -205,7 +208,7 @@ struct Visited {
 
 #[derive(Clone, Copy)]
 struct Tracer<'a, F> {
-    field: &'a Field,
+    field: &'a DecodedFrame,
     scene: &'a Scene,
     setup: &'a Setup,
     extinction: F,
@@ -229,7 +232,7 @@ struct Hit<F> {
 }
 
 impl<'a, F: Real> Tracer<'a, F> {
-    fn new(field: &'a Field, scene: &'a Scene, setup: &'a Setup) -> Self {
+    fn new(field: &'a DecodedFrame, scene: &'a Scene, setup: &'a Setup) -> Self {
         Self { field, scene, setup, extinction: F::from_f64(scene.extinction), way: None }
     }
 

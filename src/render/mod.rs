@@ -11,7 +11,7 @@
 
 mod camera;
 mod cpu;
-mod field;
+mod decoded_frame;
 pub mod gpu;
 mod image;
 mod renderer;
@@ -20,7 +20,7 @@ mod traverse;
 
 pub use camera::{Camera, CameraError, Lens, View, WorldBox};
 pub use cpu::{Scene, TraceError, optical_depths, spread, trace, trace_noting_bc4};
-pub use field::Field;
+pub use decoded_frame::DecodedFrame;
 pub use image::{Difference, Image, apart, difference, write_apng, write_png};
 pub use renderer::{Device, Renderer};
 pub use traverse::{Box3, Ray, Real, Walk};

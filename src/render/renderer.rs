@@ -4,7 +4,7 @@ use clap::ValueEnum;
 use serde::Serialize;
 
 use super::cpu::{Scene, trace};
-use super::field::Field;
+use super::decoded_frame::DecodedFrame;
 use super::gpu::{Gpu, GpuError, Uploaded};
 use super::image::Image;
 use crate::pack::{FrameReader, Pack};
@@ -84,5 +84,5 @@ impl<'a> Renderer<'a> {
 }
 
 fn on_cpu(reader: &FrameReader, scene: &Scene) -> Result<Image, GpuError> {
-    Ok(trace::<f32>(&Field::from_pack(reader)?, scene)?)
+    Ok(trace::<f32>(&DecodedFrame::from_pack(reader)?, scene)?)
 }

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 use crate::cache::{Cache, Key, Stage};
 use crate::error::{Error, Result};
 use crate::pack::{Grid, Pack};
-use crate::render::{Field, Mode, Scene, View, trace, write_png};
+use crate::render::{DecodedFrame, Mode, Scene, View, trace, write_png};
 use crate::verify::{Seen, Sources, VerifyReport, difference_map, look, shown_frames};
 
 /// Frames of a strip, at most: what still shows how a sequence moves, in 400 KB.
@@ -148,7 +148,7 @@ fn strip(pack: &Pack, g: usize, extinction: Option<f64>) -> Result<Option<Strip>
     let mode = Mode::of_grid(grid);
     let draw = |&f: &usize| -> Result<Option<Vec<u8>>> {
         crate::interrupt::check()?;
-        let field = pack.frame(g, f).and_then(|reader| Field::from_pack(&reader)).map_err(|e| {
+        let field = pack.frame(g, f).and_then(|reader| DecodedFrame::from_pack(&reader)).map_err(|e| {
             Error::Verify(format!("grid {:?} frame {}: {e}", grid.name, grid.frames[f].record.number))
         })?;
         let scene = Scene::new(grid, f, &View::default(), mode, [STRIP_SIDE; 2]);

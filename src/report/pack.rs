@@ -119,9 +119,9 @@ fn squares_by_codec(pack: &Pack) -> [f64; 6] {
     let mut squares = [0.0; 6];
     for grid in &pack.grids {
         let peak = grid.peak();
-        for (sum, norm) in squares.iter_mut().zip(grid.record.codec_norms) {
-            let norm = f64::from(norm);
-            let relative = norm / peak;
+        for (sum, error_l2) in squares.iter_mut().zip(grid.record.codec_error_l2s) {
+            let error_l2 = f64::from(error_l2);
+            let relative = error_l2 / peak;
             if relative.is_finite() {
                 *sum += relative * relative;
             }

@@ -10,7 +10,7 @@ use super::encodings::{KeptCodec, Kind, Tried};
 use super::relayout::{self, Cursor, Layout, Texture, TextureOf};
 use crate::codec::{self, Codec, OutOfRange, Texels, decode, encode};
 use crate::pack::Atlas;
-use crate::trace;
+use crate::profile;
 use crate::volume::Brick;
 
 /// One grid's bricks and how they are coded.
@@ -52,7 +52,7 @@ impl Outcome {
     /// The packing axis of the texels that a brick reads.
     pub fn axis(&self, allocation: &Allocation, brick: u32) -> u8 {
         match allocation.coding(brick) {
-            Coding::Borrowed(lender) => self.axes[lender as usize],
+            Coding::Borrowed(referenced) => self.axes[referenced as usize],
             Coding::Shared(shape) => allocation.shapes[shape as usize].axis,
             _ => self.axes[brick as usize],
         }
@@ -66,7 +66,7 @@ struct Encoded {
     bytes: Vec<u8>,
     axes: Vec<u8>,
     /// Roots of squared errors; 0 for shapes, which have none.
-    norms: Vec<f64>,
+    error_l2s: Vec<f64>,
 }
 
 /// A slab of an atlas, and what lies in it.
@@ -114,25 +114,25 @@ pub fn quantise<T: Send>(
         let encoded: Vec<_> = group
             .par_iter()
             .map(|slab| {
-                let _span = trace::span("quantise");
-                let Encoded { bytes, axes, norms } = encode_slab(shared, slab)?;
-                Ok((finish(slab.atlas, relayout::assemble(slab.atlas, &bytes))?, axes, norms))
+                let _span = profile::span("quantise");
+                let Encoded { bytes, axes, error_l2s } = encode_slab(shared, slab)?;
+                Ok((finish(slab.atlas, relayout::assemble(slab.atlas, &bytes))?, axes, error_l2s))
             })
             .collect::<Result<_, QuantiseError>>()?;
-        for ((bytes, axes, norms), slab) in encoded.into_iter().zip(&group) {
+        for ((bytes, axes, error_l2s), slab) in encoded.into_iter().zip(&group) {
             sink(slab.atlas, slab.place, bytes)?;
-            for ((texture, axis), norm) in slab.textures.iter().zip(axes).zip(norms) {
+            for ((texture, axis), error_l2) in slab.textures.iter().zip(axes).zip(error_l2s) {
                 let Some(id) = texture.brick() else { continue };
                 let grid = texture.grid as usize;
                 outcomes[grid].axes[id as usize] = axis;
-                let all = &mut grids[grid].allocation.norms;
+                let all = &mut grids[grid].allocation.error_l2s;
                 if !all.are_known {
-                    all.put(id, &[norm])?;
+                    all.put(id, &[error_l2])?;
                 }
             }
         }
     }
-    grids.iter_mut().try_for_each(|grid| grid.allocation.norms.flush())?;
+    grids.iter_mut().try_for_each(|grid| grid.allocation.error_l2s.flush())?;
     Ok(())
 }
 
@@ -161,14 +161,14 @@ fn encode_slab(grids: &[GridBricks], slab: &Slab) -> Result<Encoded, QuantiseErr
         let GridBricks { tree, allocation } = &grids[grid];
         if let TextureOf::Shape(shape) = run[0].of {
             let shape = &allocation.shapes[shape as usize];
-            all.add(Encoded { bytes: shape.bytes.clone(), axes: vec![shape.axis], norms: vec![0.0] });
+            all.add(Encoded { bytes: shape.bytes.clone(), axes: vec![shape.axis], error_l2s: vec![0.0] });
             continue;
         }
         let ids: Vec<u32> = run.iter().filter_map(Texture::brick).collect();
         all.add(match KeptCodec::of(codec) {
             Some(kept) => {
                 let Tried { costs, bytes, axes } = allocation.encodings.texels(&ids, kept)?;
-                Encoded { bytes, axes, norms: costs.iter().map(|cost| cost.norm).collect() }
+                Encoded { bytes, axes, error_l2s: costs.iter().map(|cost| cost.error_l2).collect() }
             }
             None => {
                 let bricks = tree.pool.read(&ids)?;
@@ -189,7 +189,7 @@ impl Encoded {
         }
         self.bytes.extend_from_slice(&next.bytes);
         self.axes.extend(next.axes);
-        self.norms.extend(next.norms);
+        self.error_l2s.extend(next.error_l2s);
     }
 }
 
@@ -205,13 +205,13 @@ fn encode_bricks(
         ids.iter().zip(bricks).map(|(&id, brick)| encodings.prepare(grid.tree, id, brick)).collect();
     let codec::Encoded { bytes, axes } = encode(codec, sequence, &texels)?;
     let each = bricks.iter().zip(&texels).zip(bytes.chunks_exact(codec.layout().brick_bytes())).zip(&axes);
-    let norm = |(((brick, texels), bytes), &axis): (((&Brick, &Texels), &[u8]), &u8)| match codec {
+    let error_l2 = |(((brick, texels), bytes), &axis): (((&Brick, &Texels), &[u8]), &u8)| match codec {
         Codec::F32 => 0.0,
         _ => {
             let decoded = decode(codec, bytes, axis, sequence, texels.range);
-            brick.error_norm(&decoded, &texels.carried)
+            brick.error_l2(&decoded, &texels.texel_mask)
         }
     };
-    let norms = each.map(norm).collect();
-    Ok(Encoded { bytes, axes, norms })
+    let error_l2s = each.map(error_l2).collect();
+    Ok(Encoded { bytes, axes, error_l2s })
 }

@@ -66,7 +66,7 @@ fn slots(allocation: &Allocation, counts: &mut [u32]) -> Vec<u32> {
         let slot = match allocation.coding(id) {
             Coding::Empty | Coding::Constant(_) => continue,
             Coding::Own(_) => &mut slots[id as usize],
-            Coding::Borrowed(lender) => &mut slots[lender as usize],
+            Coding::Borrowed(referenced) => &mut slots[referenced as usize],
             Coding::Shared(shape) => &mut of_shapes[shape as usize],
         };
         if *slot == NO_SLOT {
@@ -107,7 +107,7 @@ impl Layout {
             if self.slots[grid][id as usize] == next && allocations[grid].codec(id) == atlas.codec {
                 let of = match allocations[grid].coding(id) {
                     Coding::Shared(shape) => TextureOf::Shape(shape),
-                    Coding::Borrowed(lender) => TextureOf::Brick(lender),
+                    Coding::Borrowed(referenced) => TextureOf::Brick(referenced),
                     _ => TextureOf::Brick(id),
                 };
                 textures.push(Texture { grid: grid as u32, of });

@@ -241,7 +241,7 @@ impl<T: Scalar> Comparison<'_, T> {
     /// away, also in block formats, whose own promise is loose.
     fn check_error_norm(&self, error: &mut FrameError) {
         let ours = error.codec_squares.iter().sum::<f64>().sqrt();
-        let theirs = self.reader.frame().record.error_norm;
+        let theirs = self.reader.frame().record.error_l2;
         // What the pack says may be infinite or no number, and is not near anything then.
         let is_near = (ours - theirs).abs() <= NORM_TOLERANCE * ours;
         if !is_near {
@@ -288,13 +288,13 @@ impl<T: Scalar> Comparison<'_, T> {
         let values = match record.codec {
             _ if settings.clustering.is_some() => Bound::Nothing,
             // A brick may read texels that were made for another, and a record does not say whether it does: their ranges
-            // may well be equal. What was asked, and the frame's error norm, hold all the same.
+            // may well be equal. What was asked, and the frame's L2 error, hold all the same.
             codec if settings.format == Format::Adaptive && codec.is_normalised() => Bound::Nothing,
             Codec::Constant if settings.format == Format::Adaptive => {
                 // The value lies between the least and the greatest that it stands for.
                 let (source, mask) = (self.tree.leaves.values(leaf), &self.tree.leaves.masks[leaf]);
-                let carried = (0..BRICK_VOXELS).filter(|&i| mask.get(i) || !exact_inactive);
-                let range = ValueRange::union_all(carried.map(|i| ValueRange::of(self.value(source[i]))));
+                let texel_mask = (0..BRICK_VOXELS).filter(|&i| mask.get(i) || !exact_inactive);
+                let range = ValueRange::union_all(texel_mask.map(|i| ValueRange::of(self.value(source[i]))));
                 Bound::Within(range.map_or(0.0, ValueRange::width))
             }
             Codec::Constant | Codec::F32 => Bound::Exact,
@@ -398,7 +398,7 @@ enum Bound {
     Half,
     /// This much, in the grid's units.
     Within(f64),
-    /// Nothing: only the error norm holds.
+    /// Nothing: only the L2 error holds.
     Nothing,
 }
 

@@ -192,7 +192,7 @@ fn broken_table(grid: &Grid, errors: &[FrameError]) -> Vec<String> {
     if range.is_some_and(|range| range != recorded) {
         broken.push(format!("grid {:?}: the grid table's active values are not the source's", grid.name));
     }
-    for (tag, recorded) in grid.record.codec_norms.into_iter().enumerate() {
+    for (tag, recorded) in grid.record.codec_error_l2s.into_iter().enumerate() {
         let found = errors.iter().map(|error| error.codec_squares[tag]).sum::<f64>().sqrt();
         let recorded = f64::from(recorded);
         let is_near = (found - recorded).abs() <= CODEC_NORM_TOLERANCE * found + SMALLEST_FLOAT

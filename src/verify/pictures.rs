@@ -13,7 +13,7 @@ use super::Sources;
 use crate::error::{Error, Result};
 use crate::pack::{Grid, Pack};
 use crate::render::{
-    Device, Difference, Field, Image, Mode, Renderer, Scene, TraceError, View, apart, difference,
+    DecodedFrame, Device, Difference, Image, Mode, Renderer, Scene, TraceError, View, apart, difference,
     optical_depths, spread, trace, trace_noting_bc4, write_png,
 };
 use crate::stages::component::find_packed;
@@ -239,7 +239,7 @@ fn scene(grid: &Grid, frame: usize) -> Scene {
     Scene::new(grid, frame, &View::default(), Mode::of_grid(grid), [SIDE; 2])
 }
 
-fn source_picture(field: &Field, scene: &Scene) -> Result<SourcePicture, TraceError> {
+fn source_picture(field: &DecodedFrame, scene: &Scene) -> Result<SourcePicture, TraceError> {
     Ok(match scene.mode {
         Mode::Density => SourcePicture::Fog(optical_depths::<f32>(field, scene)?),
         _ => SourcePicture::Lit(trace::<f32>(field, scene)?),
@@ -275,15 +275,15 @@ fn is_blank(image: &Image) -> bool {
     image.pixels.iter().all(|pixel| pixel[..3].iter().all(|v| v.abs() < BLANK))
 }
 
-fn packed_field(pack: &Pack, [g, f]: [usize; 2]) -> Result<Field> {
-    let field = pack.frame(g, f).and_then(|reader| Field::from_pack(&reader));
+fn packed_field(pack: &Pack, [g, f]: [usize; 2]) -> Result<DecodedFrame> {
+    let field = pack.frame(g, f).and_then(|reader| DecodedFrame::from_pack(&reader));
     field.map_err(|e| {
         let grid = &pack.grids[g];
         Error::Verify(format!("grid {:?} frame {}: {e}", grid.name, grid.frames[f].record.number))
     })
 }
 
-fn source_field(pack: &Pack, sources: &Sources, [g, f]: [usize; 2]) -> Result<Field> {
+fn source_field(pack: &Pack, sources: &Sources, [g, f]: [usize; 2]) -> Result<DecodedFrame> {
     let grid = &pack.grids[g];
     let path = sources.path(grid.frames[f].record.source);
     let file = VdbFile::open(path).map_err(Error::vdb(path))?;
@@ -291,7 +291,7 @@ fn source_field(pack: &Pack, sources: &Sources, [g, f]: [usize; 2]) -> Result<Fi
     let (info, component) = find_packed(&file.grids, &grid.name, settings.integers)
         .ok_or_else(|| missing_grid(path, &grid.name))?;
     let flat = flatten(&file, path, info, component, settings.nonfinite)?;
-    Ok(Field::from_flat(flat.frame, flat.background))
+    Ok(DecodedFrame::from_flat(flat.frame, flat.background))
 }
 
 /// The error for a source without the grid that was packed from it.
@@ -323,7 +323,7 @@ pub fn look(
 ) -> Result<Option<Seen>> {
     let scene = scene(&pack.grids[g], f);
     let scene = Scene { extinction: extinction.unwrap_or(scene.extinction), ..scene };
-    let draw = |field: &Field| trace::<f32>(field, &scene).map(|image| image.to_rgb8(scene.mode));
+    let draw = |field: &DecodedFrame| trace::<f32>(field, &scene).map(|image| image.to_rgb8(scene.mode));
     let Ok(of_pack) = draw(&packed_field(pack, [g, f])?) else { return Ok(None) };
     let source = sources.map(|sources| source_field(pack, sources, [g, f])).transpose()?;
     let source = source.and_then(|field| draw(&field).ok());
@@ -334,7 +334,7 @@ fn tracer_difference(
     of_gpu: &Image,
     of_cpu: &Image,
     reads_bc4: &[bool],
-    field: &Field,
+    field: &DecodedFrame,
     scene: &Scene,
 ) -> Result<TracerDifference, TraceError> {
     let apart = |pixel: usize| apart(&of_gpu.pixels[pixel][..3], &of_cpu.pixels[pixel][..3]);

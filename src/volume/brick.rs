@@ -48,22 +48,22 @@ impl Brick {
     /// The simplest rule that gives every inactive voxel back bit by bit, and for
     /// [`InactiveRule::Sign`] the mask of those at minus the background.
     pub fn inactive_rule(&self, background: f32) -> (InactiveRule, Mask512) {
-        let mut minus = Mask512::NONE;
+        let mut sign_mask = Mask512::NONE;
         let mut inactive = 0;
         for i in (0..BRICK_VOXELS).filter(|&i| !self.active.get(i)) {
             inactive += 1;
             let bits = self.values[i].to_bits();
             if bits == background.to_bits() {
             } else if bits == (-background).to_bits() {
-                minus.set(i);
+                sign_mask.set(i);
             } else {
                 return (InactiveRule::Texel, Mask512::NONE);
             }
         }
-        match minus.count() {
-            0 => (InactiveRule::Background, minus),
-            n if n == inactive => (InactiveRule::MinusBackground, minus),
-            _ => (InactiveRule::Sign, minus),
+        match sign_mask.count() {
+            0 => (InactiveRule::Background, sign_mask),
+            n if n == inactive => (InactiveRule::MinusBackground, sign_mask),
+            _ => (InactiveRule::Sign, sign_mask),
         }
     }
 
@@ -78,15 +78,15 @@ impl Brick {
     }
 
     /// The root of the sum of squared differences between other values and this brick's, over the voxels that
-    /// `carried` names.
-    pub fn error_norm(&self, values: &[f32; BRICK_VOXELS], carried: &Mask512) -> f64 {
+    /// `texel_mask` names.
+    pub fn error_l2(&self, values: &[f32; BRICK_VOXELS], texel_mask: &Mask512) -> f64 {
         let square = |i: usize| (f64::from(values[i]) - f64::from(self.values[i])).powi(2);
-        carried.ones().map(square).sum::<f64>().sqrt()
+        texel_mask.ones().map(square).sum::<f64>().sqrt()
     }
 
-    /// Smallest and largest value among the voxels that `carried` names.
-    pub fn range_over(&self, carried: &Mask512) -> Option<(f32, f32)> {
-        carried.ones().map(|i| self.values[i]).fold(None, |range, v| match range {
+    /// Smallest and largest value among the voxels that `texel_mask` names.
+    pub fn range_over(&self, texel_mask: &Mask512) -> Option<(f32, f32)> {
+        texel_mask.ones().map(|i| self.values[i]).fold(None, |range, v| match range {
             None => Some((v, v)),
             Some((min, max)) => Some((min.min(v), max.max(v))),
         })

@@ -20,4 +20,4 @@ pub use list::List;
 pub use mask::{Mask512, bits};
 pub use pool::{BRICKS_IN_FLIGHT, BrickPool, Interner};
 pub use scratch::{SCRATCH_SMALL, Scratch, ScratchFolder};
-pub use sparse::Sparse;
+pub use sparse::SortedMap;

@@ -2,15 +2,15 @@
 
 /// Entries by brick: eight bytes or so for each that there is, and nothing for the others.
 #[derive(Debug)]
-pub struct Sparse<T>(Vec<(u32, T)>);
+pub struct SortedMap<T>(Vec<(u32, T)>);
 
-impl<T> Default for Sparse<T> {
+impl<T> Default for SortedMap<T> {
     fn default() -> Self {
         Self(Vec::new())
     }
 }
 
-impl<T: Copy> Sparse<T> {
+impl<T: Copy> SortedMap<T> {
     /// Adds the entry of a brick that comes after all that have one.
     ///
     /// # Panics

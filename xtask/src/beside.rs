@@ -16,8 +16,8 @@ use volpack::sweep::{Difference, difference};
 use volpack::vdb::VdbFile;
 use volpack::volume::{Mask512, ValueRange};
 
-use crate::measured::{self, Run, median};
 use crate::peers;
+use crate::process_stats::{self, Run, median};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -75,7 +75,7 @@ fn builds(args: &Args, files: &[PathBuf], folder: &Path) -> Result<Json, Box<dyn
     };
     let ours = |options: &[&str]| {
         let grid = [&["-g", &args.grid], options].concat();
-        measured::build(&args.volpack, &grid, files, &pack)
+        process_stats::build(&args.volpack, &grid, files, &pack)
     };
     let side = |name, beside| Side { name, beside, runs: Vec::new(), bytes: 0, psnr: None };
     let mut sides = [
@@ -87,7 +87,7 @@ fn builds(args: &Args, files: &[PathBuf], folder: &Path) -> Result<Json, Box<dyn
     ];
     for round in 0..args.rounds {
         for (side, command) in &mut sides {
-            side.runs.push(measured::run(command)?);
+            side.runs.push(process_stats::run(command)?);
             if round == 0 {
                 side.bytes = if side.beside.is_some() { &pack } else { &nvdb }.metadata()?.len();
             }
@@ -195,7 +195,7 @@ fn blocks(files: &[PathBuf], args: &Args) -> Result<Json, Box<dyn Error>> {
             if range.width() > 0.0 {
                 // Stretched to 0..1, as a range of its own does it.
                 let values = values.map(|v| (v - range.min) / (range.max - range.min));
-                bricks.push(Texels { values, carried: Mask512::ALL, range: BrickRange::SEQUENCE });
+                bricks.push(Texels { values, texel_mask: Mask512::ALL, range: BrickRange::SEQUENCE });
             }
         }
     }

@@ -8,8 +8,8 @@ use std::time::Instant;
 
 use serde_json::json;
 
-use crate::measured::median;
 use crate::peers;
+use crate::process_stats::median;
 
 #[derive(clap::Args)]
 pub struct Args {

@@ -11,8 +11,8 @@ use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::settings::{Format, Quality, Settings};
 use volpack::vdb::VdbFile;
 
-use crate::measured::median;
 use crate::peers;
+use crate::process_stats::median;
 use crate::scale::Sequences;
 
 #[derive(clap::Args)]

@@ -8,8 +8,8 @@ use std::time::Instant;
 use serde_json::{Value as Json, json};
 use volpack::vdb::{VdbFile, with_scalar_type};
 
-use crate::measured::median;
 use crate::peers;
+use crate::process_stats::median;
 
 #[derive(clap::Args)]
 pub struct Args {

@@ -6,8 +6,8 @@ use std::process::Command;
 
 use serde_json::json;
 
-use crate::measured::{self, median};
 use crate::peers;
+use crate::process_stats::{self, median};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -54,10 +54,20 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     for (name, options) in CASES {
         let (mut shorts, mut longs) = (Vec::new(), Vec::new());
         for _ in 0..args.rounds {
-            shorts.push(measured::run(&mut measured::build(&args.volpack, options, short, &output))?);
-            longs.push(measured::run(&mut measured::build(&args.volpack, options, &long, &output))?);
+            shorts.push(process_stats::run(&mut process_stats::build(
+                &args.volpack,
+                options,
+                short,
+                &output,
+            ))?);
+            longs.push(process_stats::run(&mut process_stats::build(
+                &args.volpack,
+                options,
+                &long,
+                &output,
+            ))?);
         }
-        let of = |figure: fn(&measured::Run) -> f64| {
+        let of = |figure: fn(&process_stats::Run) -> f64| {
             (median(shorts.iter().map(figure)), median(longs.iter().map(figure)))
         };
         let (short_s, long_s) = of(|run| run.seconds);

@@ -16,8 +16,8 @@ use volpack::sweep::nanovdb::{self, Quantise};
 use volpack::sweep::{Steady, steady};
 
 use crate::beside::TOLERANCE;
-use crate::measured::median;
 use crate::peers;
+use crate::process_stats::median;
 
 #[derive(clap::Args)]
 pub struct Args {

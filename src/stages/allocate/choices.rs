@@ -1,4 +1,4 @@
-//! What each rung comes to for a brick, and what is exact of it.
+//! What each candidate comes to for a brick, and what is exact of it.
 
 use std::collections::HashMap;
 use std::io;
@@ -6,24 +6,24 @@ use std::io;
 use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
 
-use super::rung::Rung;
-use super::share::Loan;
+use super::borrow::TexelReference;
+use super::candidate::Candidate;
 use crate::stages::encodings::{Cost, Encodings, KeptCodec, Kind};
 use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder};
 
 /// An L3 record is three words.
 pub(super) const RECORD_BITS: u32 = 96;
 
-/// What the rungs come to that have a cost of their own, in squared peaks: half as wide as costs are, since all of a
-/// sequence's are looked at in every pass of a search. They serve to choose between rungs; what a chosen one costs is
+/// What the candidates come to that have a cost of their own, in squared peaks: half as wide as costs are, since all of a
+/// sequence's are looked at in every pass of a search. They serve to choose between candidates; what a chosen one costs is
 /// read from the encodings.
 #[derive(Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
 pub(super) struct Choices {
     /// Over all users and over all the voxels that texels give.
-    distortion: [f32; Rung::OWN],
+    distortion: [f32; Candidate::OWN],
     /// Over active voxels.
-    active_squares: [f32; Rung::OWN],
+    active_squares: [f32; Candidate::OWN],
     /// How often the brick is used over all frames.
     uses: u32,
     /// How many L3 records it has: one in every run that it is in.
@@ -36,21 +36,21 @@ impl Choices {
         Self { uses, records, ..Self::zeroed() }
     }
 
-    /// Notes what a rung comes to.
-    fn set(&mut self, rung: Rung, cost: Cost, peak: f64) {
-        let Some(i) = rung.own() else { return };
+    /// Notes what a candidate comes to.
+    fn set(&mut self, candidate: Candidate, cost: Cost, peak: f64) {
+        let Some(i) = candidate.own() else { return };
         // What is infinite is out of the question, so nothing else may be.
         let narrow = |v: f64| if v.is_infinite() { f32::INFINITY } else { (v as f32).min(f32::MAX) };
-        self.distortion[i] = narrow(in_peaks(cost.norm, peak) * f64::from(self.uses));
-        self.active_squares[i] = narrow(in_peaks(cost.active_norm, peak));
+        self.distortion[i] = narrow(in_peaks(cost.error_l2, peak) * f64::from(self.uses));
+        self.active_squares[i] = narrow(in_peaks(cost.active_error_l2, peak));
     }
 }
 
-/// What the rungs come to for one brick, its loan among them.
+/// What the candidates come to for one brick, its texel reference among them.
 #[derive(Clone, Copy)]
 pub(super) struct Weighed<'a> {
     choices: &'a Choices,
-    loan: Option<&'a Loan>,
+    reference: Option<&'a TexelReference>,
     table: &'a Table,
 }
 
@@ -62,41 +62,41 @@ impl Weighed<'_> {
 
     /// The error in squared peaks, over all users and over all the voxels that the texels give. That of a codec that
     /// was not tried is none.
-    pub fn distortion(&self, rung: Rung) -> f64 {
-        match rung {
-            Rung::Borrowed => self.loan.map_or(f64::INFINITY, |loan| self.borrowed(loan)),
-            rung => rung.own().map_or(0.0, |i| self.choices.distortion[i].into()),
+    pub fn distortion(&self, candidate: Candidate) -> f64 {
+        match candidate {
+            Candidate::Borrowed => self.reference.map_or(f64::INFINITY, |reference| self.borrowed(reference)),
+            candidate => candidate.own().map_or(0.0, |i| self.choices.distortion[i].into()),
         }
     }
 
-    /// The same with some loan.
-    pub fn borrowed(&self, loan: &Loan) -> f64 {
-        in_peaks(loan.norm, self.table.peak) * self.uses()
+    /// The same with some texel reference.
+    pub fn borrowed(&self, reference: &TexelReference) -> f64 {
+        in_peaks(reference.error_l2, self.table.peak) * self.uses()
     }
 
     /// The error for one user, over active voxels.
-    pub fn active_squares(&self, rung: Rung) -> f64 {
-        match rung {
-            Rung::Borrowed => {
-                self.loan.map_or(f64::INFINITY, |loan| in_peaks(loan.active_norm, self.table.peak))
-            }
-            rung => rung.own().map_or(0.0, |i| self.choices.active_squares[i].into()),
+    pub fn active_squares(&self, candidate: Candidate) -> f64 {
+        match candidate {
+            Candidate::Borrowed => self
+                .reference
+                .map_or(f64::INFINITY, |reference| in_peaks(reference.active_error_l2, self.table.peak)),
+            candidate => candidate.own().map_or(0.0, |i| self.choices.active_squares[i].into()),
         }
     }
 
     /// The bits of the texels and of all records.
-    pub fn bits(&self, rung: Rung) -> f64 {
-        let records = if rung == Rung::Empty { 0 } else { self.choices.records };
-        self.table.texel_bits[rung as usize] + f64::from(RECORD_BITS) * f64::from(records)
+    pub fn bits(&self, candidate: Candidate) -> f64 {
+        let records = if candidate == Candidate::Empty { 0 } else { self.choices.records };
+        self.table.texel_bits[candidate as usize] + f64::from(RECORD_BITS) * f64::from(records)
     }
 
-    /// The rung with the least D + λR; of equals the one of fewest bits.
-    pub fn best(&self, lambda: f64) -> Rung {
-        let (mut best, mut least) = (Rung::F32, f64::INFINITY);
-        for rung in Rung::ALL {
-            let cost = self.distortion(rung) + lambda * self.bits(rung);
+    /// The candidate with the least D + λR; of equals the one of fewest bits.
+    pub fn best(&self, lambda: f64) -> Candidate {
+        let (mut best, mut least) = (Candidate::F32, f64::INFINITY);
+        for candidate in Candidate::ALL {
+            let cost = self.distortion(candidate) + lambda * self.bits(candidate);
             if cost < least {
-                (best, least) = (rung, cost);
+                (best, least) = (candidate, cost);
             }
         }
         best
@@ -104,60 +104,69 @@ impl Weighed<'_> {
 }
 
 /// An error in squared peaks.
-fn in_peaks(norm: f64, peak: f64) -> f64 {
-    (norm / peak) * (norm / peak)
+fn in_peaks(error_l2: f64, peak: f64) -> f64 {
+    (error_l2 / peak) * (error_l2 / peak)
 }
 
 /// Bricks that are looked at together: what a thread reads of the table at a time.
 pub(super) const BLOCK: u32 = 1024;
 
-/// What every rung comes to for every brick. A long sequence's table is in scratch, and passes over it read it anew.
+/// What every candidate comes to for every brick. A long sequence's table is in scratch, and passes over it read it anew.
 pub(super) struct Table {
     /// What errors are measured against.
     pub peak: f64,
-    /// Of each rung; looked up more than anything else.
-    texel_bits: [f64; Rung::ALL.len()],
+    /// Of each candidate; looked up more than anything else.
+    texel_bits: [f64; Candidate::ALL.len()],
     bricks: u32,
     choices: Scratch,
     /// What bricks borrow, and which of them do.
-    loans: HashMap<u32, Loan>,
-    has_loan: Vec<bool>,
+    texel_references: HashMap<u32, TexelReference>,
+    has_reference: Vec<bool>,
 }
 
 impl Table {
     /// Of no brick yet.
     pub fn new(scratch: &ScratchFolder, peak: f64) -> Self {
         let choices = Scratch::new(scratch, size_of::<Choices>(), SCRATCH_SMALL);
-        let texel_bits = Rung::ALL.map(|rung| rung.texel_bits().into());
-        Self { peak, texel_bits, bricks: 0, choices, loans: HashMap::new(), has_loan: Vec::new() }
+        let texel_bits = Candidate::ALL.map(|candidate| candidate.texel_bits().into());
+        Self {
+            peak,
+            texel_bits,
+            bricks: 0,
+            choices,
+            texel_references: HashMap::new(),
+            has_reference: Vec::new(),
+        }
     }
 
-    /// Adds the next bricks, and what the rungs come to for them.
+    /// Adds the next bricks, and what the candidates come to for them.
     ///
     /// # Errors
     /// When the scratch file cannot be written.
     pub fn add(
         &mut self,
-        bricks: impl Iterator<Item = (Choices, [Cost; Rung::ALL.len()])>,
+        bricks: impl Iterator<Item = (Choices, [Cost; Candidate::ALL.len()])>,
     ) -> io::Result<()> {
         for (mut choices, costs) in bricks {
-            Rung::ALL.into_iter().for_each(|rung| choices.set(rung, costs[rung as usize], self.peak));
+            Candidate::ALL
+                .into_iter()
+                .for_each(|candidate| choices.set(candidate, costs[candidate as usize], self.peak));
             self.choices.put(self.bricks, bytemuck::bytes_of(&choices))?;
             self.bricks += 1;
         }
-        self.has_loan.resize(self.bricks as usize, false);
+        self.has_reference.resize(self.bricks as usize, false);
         self.choices.flush()
     }
 
-    /// Notes what a rung comes to for some bricks, ascending.
+    /// Notes what a candidate comes to for some bricks, ascending.
     ///
     /// # Errors
     /// When the scratch file fails.
-    pub fn weigh(&mut self, ids: &[u32], rung: Rung, costs: &[Cost]) -> io::Result<()> {
+    pub fn weigh(&mut self, ids: &[u32], candidate: Candidate, costs: &[Cost]) -> io::Result<()> {
         let mut costs = costs.iter();
         self.choices.update(ids, |record| {
             let mut choices: Choices = bytemuck::pod_read_unaligned(record);
-            choices.set(rung, *costs.next().expect("a cost a brick"), self.peak);
+            choices.set(candidate, *costs.next().expect("a cost a brick"), self.peak);
             record.copy_from_slice(bytemuck::bytes_of(&choices));
         })
     }
@@ -177,7 +186,7 @@ impl Table {
 
     /// What was noted of a brick and what it borrows.
     pub fn weighed<'a>(&'a self, id: u32, choices: &'a Choices) -> Weighed<'a> {
-        Weighed { choices, loan: self.loan(id), table: self }
+        Weighed { choices, reference: self.reference(id), table: self }
     }
 
     /// Looks at every brick, on all cores. Blocks come in order.
@@ -213,60 +222,60 @@ impl Table {
     }
 
     /// What a brick borrows.
-    pub fn loan(&self, id: u32) -> Option<&Loan> {
+    pub fn reference(&self, id: u32) -> Option<&TexelReference> {
         // Most have none, and a look at a flag is less than one into a map.
-        if self.has_loan[id as usize] { self.loans.get(&id) } else { None }
+        if self.has_reference[id as usize] { self.texel_references.get(&id) } else { None }
     }
 
-    /// Gives a brick a loan.
-    pub fn lend(&mut self, id: u32, loan: Loan) {
-        self.loans.insert(id, loan);
-        self.has_loan[id as usize] = true;
+    /// Gives a brick a texel reference.
+    pub fn add_reference(&mut self, id: u32, reference: TexelReference) {
+        self.texel_references.insert(id, reference);
+        self.has_reference[id as usize] = true;
     }
 
-    /// Ends all loans but some.
-    pub fn keep_loans(&mut self, is_kept: impl Fn(u32, &Loan) -> bool) {
-        self.loans.retain(|&id, loan| is_kept(id, loan));
-        self.has_loan.fill(false);
-        self.loans.keys().for_each(|&id| self.has_loan[id as usize] = true);
+    /// Ends all texel references but some.
+    pub fn keep_references(&mut self, is_kept: impl Fn(u32, &TexelReference) -> bool) {
+        self.texel_references.retain(|&id, reference| is_kept(id, reference));
+        self.has_reference.fill(false);
+        self.texel_references.keys().for_each(|&id| self.has_reference[id as usize] = true);
     }
 
-    /// Ends all loans.
-    pub fn forget_loans(&mut self) {
-        self.keep_loans(|_, _| false);
+    /// Ends all texel references.
+    pub fn forget_references(&mut self) {
+        self.keep_references(|_, _| false);
     }
 
-    /// All loans.
-    pub fn into_loans(self) -> HashMap<u32, Loan> {
-        self.loans
+    /// All texel references.
+    pub fn into_references(self) -> HashMap<u32, TexelReference> {
+        self.texel_references
     }
 }
 
-/// What rungs do to some bricks, by [`Rung::ALL`], and [`Rung::Constant`]'s values. What was not tried costs nothing,
-/// and loans are not among it.
+/// What candidates do to some bricks, by [`Candidate::ALL`], and [`Candidate::Constant`]'s values. What was not tried costs nothing,
+/// and texel references are not among it.
 pub(super) fn costs(
     encodings: &Encodings,
     ids: &[u32],
     bc7_is_tried: &[bool],
-) -> io::Result<Vec<([Cost; Rung::ALL.len()], f32)>> {
+) -> io::Result<Vec<([Cost; Candidate::ALL.len()], f32)>> {
     let mut all = Vec::with_capacity(ids.len());
     for plain in encodings.plain(ids)? {
-        let mut costs = [Cost::NONE; Rung::ALL.len()];
-        costs[Rung::Empty as usize] = plain.empty;
-        costs[Rung::Constant as usize] = plain.constant;
-        costs[Rung::F16 as usize] = plain.f16;
-        costs[Rung::Borrowed as usize] = Cost::IMPOSSIBLE;
+        let mut costs = [Cost::NONE; Candidate::ALL.len()];
+        costs[Candidate::Empty as usize] = plain.empty;
+        costs[Candidate::Constant as usize] = plain.constant;
+        costs[Candidate::F16 as usize] = plain.f16;
+        costs[Candidate::Borrowed as usize] = Cost::IMPOSSIBLE;
         all.push((costs, plain.value));
     }
-    for (rung, codec) in [(Rung::Bc4, KeptCodec::Bc4), (Rung::Unorm8, KeptCodec::Unorm8)] {
+    for (candidate, codec) in [(Candidate::Bc4, KeptCodec::Bc4), (Candidate::Unorm8, KeptCodec::Unorm8)] {
         for ((costs, _), cost) in all.iter_mut().zip(encodings.costs(ids, codec)?) {
-            costs[rung as usize] = cost;
+            costs[candidate as usize] = cost;
         }
     }
     let tried = || (0..ids.len()).filter(|&i| bc7_is_tried[ids[i] as usize]);
     let bc7: Vec<u32> = tried().map(|i| ids[i]).collect();
     for (i, cost) in tried().zip(encodings.costs(&bc7, KeptCodec::Bc7)?) {
-        all[i].0[Rung::Bc7 as usize] = cost;
+        all[i].0[Candidate::Bc7 as usize] = cost;
     }
     Ok(all)
 }

@@ -8,7 +8,7 @@ use super::kmeans::{KMeansSettings, kmeans};
 use super::{AllocateError, Allocation, Coding, Shape, windows};
 use crate::codec::{BrickRange, Codec, SequenceRange, Texels, decode, encode};
 use crate::settings::{Clustering, RangeMode};
-use crate::stages::dedup::{SequenceTree, carried};
+use crate::stages::dedup::{SequenceTree, texel_mask};
 use crate::stages::encodings::Encodings;
 use crate::volume::{BRICK_VOXELS, BRICKS_IN_FLIGHT, Brick, Mask512, ValueRange};
 
@@ -85,8 +85,8 @@ pub fn clustered(
     {
         let bricks = tree.pool.read(ids)?;
         for ((&id, &shape), brick) in ids.iter().zip(shapes).zip(&bricks) {
-            let carried = carried(&brick.active, rules[id as usize]);
-            allocation.norms.put(id, &[brick.error_norm(&decoded[shape as usize], &carried)])?;
+            let texel_mask = texel_mask(&brick.active, rules[id as usize]);
+            allocation.error_l2s.put(id, &[brick.error_l2(&decoded[shape as usize], &texel_mask)])?;
         }
     }
     Ok(allocation)
@@ -114,7 +114,7 @@ fn texels(sequence: &SequenceRange, mode: RangeMode, centroid: &[f32]) -> Texels
         RangeMode::Sequence => BrickRange::SEQUENCE,
         RangeMode::Brick => fit(sequence, &values),
     };
-    Texels { values, carried: Mask512::ALL, range }
+    Texels { values, texel_mask: Mask512::ALL, range }
 }
 
 /// The tightest brick range around some values.

@@ -152,27 +152,32 @@ fn means(data: &[f32], dims: usize, near: &[(u32, f32)], old: &[f32]) -> Vec<f32
 struct Sums {
     total: f32,
     /// Sum of absolute values, the scale of the rounding of the other sums.
-    norm: f32,
+    error_l2: f32,
     coarse: [f32; COARSE],
     fine: [f32; FINE],
 }
 
 impl Sums {
     fn new(row: &[f32]) -> Self {
-        let (mut norm, mut fine, mut coarse) = (0f64, [0f64; FINE], [0f64; COARSE]);
+        let (mut error_l2, mut fine, mut coarse) = (0f64, [0f64; FINE], [0f64; COARSE]);
         let width = row.len().div_ceil(FINE).max(1);
         for (i, &v) in row.iter().enumerate() {
             // Of a brick's index, the upper two bits of each of x, y and z.
             let block =
                 if row.len() == 512 { i >> 7 << 4 | (i >> 4 & 3) << 2 | i >> 1 & 3 } else { i / width };
             fine[block] += f64::from(v);
-            norm += f64::from(v.abs());
+            error_l2 += f64::from(v.abs());
         }
         for (i, v) in fine.iter().enumerate() {
             coarse[i >> 5 << 2 | (i >> 3 & 1) << 1 | i >> 1 & 1] += v;
         }
         let total = coarse.iter().sum::<f64>() as f32;
-        Sums { total, norm: norm as f32, coarse: coarse.map(|v| v as f32), fine: fine.map(|v| v as f32) }
+        Sums {
+            total,
+            error_l2: error_l2 as f32,
+            coarse: coarse.map(|v| v as f32),
+            fine: fine.map(|v| v as f32),
+        }
     }
 }
 
@@ -182,7 +187,7 @@ struct Index {
     /// Each centroid's number, ascending among equal totals, and its sums.
     entries: Vec<(u32, Sums)>,
     /// Greatest norm of a centroid.
-    norm: f32,
+    error_l2: f32,
 }
 
 impl Index {
@@ -190,8 +195,8 @@ impl Index {
         let mut entries: Vec<(u32, Sums)> =
             (0..clusters).into_par_iter().map(|c| (c as u32, Sums::new(row(centroids, dims, c)))).collect();
         entries.sort_by(|a, b| a.1.total.total_cmp(&b.1.total));
-        let norm = entries.iter().map(|e| e.1.norm).fold(0.0, f32::max);
-        Index { entries, norm }
+        let error_l2 = entries.iter().map(|e| e.1.error_l2).fold(0.0, f32::max);
+        Index { entries, error_l2 }
     }
 
     /// A centroid likely to be near: the one with the nearest coarse sums.
@@ -208,7 +213,7 @@ impl Index {
         // w + 24 roundings and a bound, its parts swapped for exact ones, at most w + 43. Both margins here are
         // these doubled, with 2w + 67 rounded up to 2w + 128.
         let relative = 1.0 + (dims.div_ceil(FINE) + 64) as f32 * f32::EPSILON;
-        let absolute = f32::EPSILON * (sums.norm + self.norm);
+        let absolute = f32::EPSILON * (sums.error_l2 + self.error_l2);
         let mut best = (hint, distance(row, self::row(centroids, dims, hint as usize)));
         let mut limit = best.1 * relative + absolute;
         // False once the totals alone rule out this entry and all beyond it.

@@ -4,12 +4,12 @@
 //! D + λR, with one λ for all (Shoham & Gersho 1988).
 
 mod adaptive;
+mod borrow;
+mod candidate;
 mod choices;
 mod cluster;
 pub mod kmeans;
-mod rung;
 mod search;
-mod share;
 mod size;
 
 use std::io;
@@ -19,7 +19,7 @@ use half::f16;
 use super::dedup::SequenceTree;
 use super::encodings::Encodings;
 use crate::codec::{BrickRange, Codec, OutOfRange, SequenceRange};
-use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder, Sparse, ValueRange};
+use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder, SortedMap, ValueRange};
 
 pub use adaptive::{AdaptiveGrid, Target, adaptive};
 pub use cluster::clustered;
@@ -30,14 +30,14 @@ pub struct Allocation {
     pub sequence: SequenceRange,
     /// How each brick of the pool is coded, as far as a byte says it.
     kinds: Vec<Kind>,
-    /// What else there is to say of those of which it does not say all: a value's bits, a lender, a shape.
-    words: Sparse<u32>,
+    /// What else there is to say of those of which it does not say all: a value's bits, a referenced brick, a shape.
+    words: SortedMap<u32>,
     /// Texels of no brick's own that several bricks share.
     pub shapes: Vec<Shape>,
     /// Under which range a brick reads texels that were made for another.
-    borrowed: Sparse<BrickRange>,
+    borrowed: SortedMap<BrickRange>,
     /// The root of the squared error of each brick over the voxels that its texels give.
-    pub norms: Norms,
+    pub error_l2s: Norms,
     /// The squared error of each frame's empty bricks.
     pub empty_squares: Vec<f64>,
     /// What codecs make of them.
@@ -71,7 +71,7 @@ enum Kind {
 
 /// Errors of bricks, 8 bytes each, of which a sequence has too many to keep in memory.
 pub struct Norms {
-    norms: Scratch,
+    error_l2s: Scratch,
     /// Whether there is one for each brick before its texels are made. Else quantising adds those that lack.
     pub are_known: bool,
 }
@@ -100,15 +100,15 @@ pub enum AllocateError {
 impl Norms {
     /// None yet.
     fn new(scratch: &ScratchFolder) -> Self {
-        Self { norms: Scratch::new(scratch, size_of::<f64>(), SCRATCH_SMALL), are_known: false }
+        Self { error_l2s: Scratch::new(scratch, size_of::<f64>(), SCRATCH_SMALL), are_known: false }
     }
 
     /// Notes those of bricks, one after another.
     ///
     /// # Errors
     /// When the scratch file cannot be written.
-    pub fn put(&mut self, first: u32, norms: &[f64]) -> io::Result<()> {
-        self.norms.put(first, bytemuck::cast_slice(norms))
+    pub fn put(&mut self, first: u32, error_l2s: &[f64]) -> io::Result<()> {
+        self.error_l2s.put(first, bytemuck::cast_slice(error_l2s))
     }
 
     /// Sees to it that what was noted can be read.
@@ -116,7 +116,7 @@ impl Norms {
     /// # Errors
     /// When the scratch file cannot be written.
     pub fn flush(&mut self) -> io::Result<()> {
-        self.norms.flush()
+        self.error_l2s.flush()
     }
 
     /// Those of some bricks.
@@ -124,7 +124,7 @@ impl Norms {
     /// # Errors
     /// When the scratch file cannot be read back.
     pub fn read(&self, ids: &[u32]) -> io::Result<Vec<f64>> {
-        self.norms.read_as(ids)
+        self.error_l2s.read_as(ids)
     }
 }
 
@@ -133,10 +133,10 @@ impl Allocation {
         Self {
             sequence: encodings.sequence,
             kinds: Vec::new(),
-            words: Sparse::default(),
+            words: SortedMap::default(),
             shapes: Vec::new(),
-            borrowed: Sparse::default(),
-            norms: Norms::new(scratch),
+            borrowed: SortedMap::default(),
+            error_l2s: Norms::new(scratch),
             empty_squares: Vec::new(),
             encodings,
         }
@@ -149,7 +149,7 @@ impl Allocation {
             Coding::Empty => (Kind::Empty, None),
             Coding::Constant(value) => (Kind::Constant, Some(value.to_bits())),
             Coding::Own(codec) => (Kind::Own(codec), None),
-            Coding::Borrowed(lender) => (Kind::Borrowed, Some(lender)),
+            Coding::Borrowed(referenced) => (Kind::Borrowed, Some(referenced)),
             Coding::Shared(shape) => (Kind::Shared, Some(shape)),
         };
         self.kinds.push(kind);
@@ -184,7 +184,7 @@ impl Allocation {
         match self.coding(brick) {
             Coding::Empty | Coding::Constant(_) => Codec::Constant,
             Coding::Own(codec) => codec,
-            Coding::Borrowed(lender) => self.codec(lender),
+            Coding::Borrowed(referenced) => self.codec(referenced),
             Coding::Shared(shape) => self.shapes[shape as usize].codec,
         }
     }

@@ -10,14 +10,14 @@ use std::io;
 use std::sync::LazyLock;
 
 use super::adaptive::AdaptiveGrid;
+use super::borrow::{TexelReference, texel_references};
+use super::candidate::Candidate;
 use super::choices::{BLOCK, Choices, Table, Weighed, costs};
-use super::rung::Rung;
-use super::share::{Loan, loans};
 use super::{Allocation, Coding, windows};
+use crate::profile;
 use crate::settings::Quality;
 use crate::stages::dedup::{FrameTree, Payload, SequenceTree};
 use crate::stages::encodings::{Cost, Encodings, KeptCodec, Kind};
-use crate::trace;
 
 /// A step is 1.1 % of λ, under 0.05 dB of PSNR.
 const STEPS_PER_OCTAVE: u32 = 64;
@@ -60,8 +60,8 @@ pub(super) struct GridSearch<'a> {
     /// The bricks that this search asked for in BC7. A cache may know of more, but what it knows by chance must not
     /// lead the search elsewhere.
     bc7_is_tried: Vec<bool>,
-    /// The rung of bricks that lend their texels.
-    lends: Vec<Option<Rung>>,
+    /// The candidate of bricks that lend their texels.
+    lends: Vec<Option<Candidate>>,
     active_voxels: u64,
 }
 
@@ -94,7 +94,8 @@ impl<'a> GridSearch<'a> {
         for ids in windows(uses.len() as u32, BLOCK) {
             let costs = costs(&search.encodings, &ids, &search.bc7_is_tried)?;
             let choices = |&id: &u32| Choices::new(uses[id as usize], records[id as usize]);
-            search.may_vanish |= costs.iter().any(|(costs, _)| costs[Rung::Empty as usize].norm > 0.0);
+            search.may_vanish |=
+                costs.iter().any(|(costs, _)| costs[Candidate::Empty as usize].error_l2 > 0.0);
             search.table.add(ids.iter().map(choices).zip(costs.into_iter().map(|(costs, _)| costs)))?;
         }
         search.may_vanish &= !search.tree.has_constants();
@@ -103,8 +104,8 @@ impl<'a> GridSearch<'a> {
 
     /// Whether a choice leaves nothing of a grid that has something to show: a few bright voxels among many that are 0 may
     /// be less than the error that a PSNR allows.
-    fn is_nothing(&self, picks: &[Rung]) -> bool {
-        self.may_vanish && picks.iter().all(|rung| *rung == Rung::Empty)
+    fn is_nothing(&self, picks: &[Candidate]) -> bool {
+        self.may_vanish && picks.iter().all(|candidate| *candidate == Candidate::Empty)
     }
 
     /// The squared peaks that `voxels` may err by together at some PSNR, against the nearest floats of their source.
@@ -120,26 +121,26 @@ impl<'a> GridSearch<'a> {
         10.0 * (voxels as f64 / squares).log10()
     }
 
-    /// The rung that a brick gets at a step.
-    fn pick(&self, id: u32, weighed: Weighed, step: u32) -> Rung {
-        if let Some(rung) = self.lends[id as usize] {
-            return rung;
+    /// The candidate that a brick gets at a step.
+    fn pick(&self, id: u32, weighed: Weighed, step: u32) -> Candidate {
+        if let Some(candidate) = self.lends[id as usize] {
+            return candidate;
         }
         let step = step.max(self.least_step[id as usize].into());
         if step == 0 {
             // The coarsest there is: no error is too large.
-            let possible = |rung: &Rung| weighed.distortion(*rung).is_finite();
-            return Rung::ALL.into_iter().find(possible).unwrap_or(Rung::F32);
+            let possible = |candidate: &Candidate| weighed.distortion(*candidate).is_finite();
+            return Candidate::ALL.into_iter().find(possible).unwrap_or(Candidate::F32);
         }
         weighed.best(lambda(step))
     }
 
-    pub(super) fn picks(&self, step: u32) -> io::Result<Vec<Rung>> {
+    pub(super) fn picks(&self, step: u32) -> io::Result<Vec<Candidate>> {
         self.table.each(|id, weighed| self.pick(id, weighed, step))
     }
 
     /// The squared error of all frames over active voxels.
-    pub(super) fn squares(&self, picks: &[Rung]) -> io::Result<f64> {
+    pub(super) fn squares(&self, picks: &[Candidate]) -> io::Result<f64> {
         self.table.sum(|id, weighed| weighed.uses() * weighed.active_squares(picks[id as usize]))
     }
 
@@ -151,14 +152,15 @@ impl<'a> GridSearch<'a> {
     /// Tries what was picked without having been tried. Whether there was any.
     pub(super) fn try_unknown(
         &mut self,
-        picks: impl Iterator<Item = (u32, Rung)>,
+        picks: impl Iterator<Item = (u32, Candidate)>,
         advance: &mut dyn FnMut(u64),
     ) -> io::Result<bool> {
-        let unknown = picks.filter(|&(id, rung)| rung == Rung::Bc7 && !self.bc7_is_tried[id as usize]);
+        let unknown =
+            picks.filter(|&(id, candidate)| candidate == Candidate::Bc7 && !self.bc7_is_tried[id as usize]);
         let unknown: Vec<u32> = unknown.map(|(id, _)| id).collect();
         self.encodings.make(self.tree, &unknown, &[Kind::Texels(KeptCodec::Bc7)], advance)?;
         for ids in unknown.chunks(BLOCK as usize) {
-            self.table.weigh(ids, Rung::Bc7, &self.encodings.costs(ids, KeptCodec::Bc7)?)?;
+            self.table.weigh(ids, Candidate::Bc7, &self.encodings.costs(ids, KeptCodec::Bc7)?)?;
             ids.iter().for_each(|&id| self.bc7_is_tried[id as usize] = true);
         }
         Ok(!unknown.is_empty())
@@ -169,15 +171,15 @@ impl<'a> GridSearch<'a> {
         psnr: f64,
         floor: f64,
         advance: &mut dyn FnMut(u64),
-    ) -> io::Result<Vec<Rung>> {
+    ) -> io::Result<Vec<Candidate>> {
         let (step, alone) = self.at_psnr_with_loans(psnr, floor, None, advance)?;
-        self.find_loans(&alone, step, advance)?;
+        self.find_references(&alone, step, advance)?;
         let (_, together) = self.at_psnr_with_loans(psnr, floor, Some(step), advance)?;
-        let bits = |picks: &[Rung]| self.table.sum(|id, weighed| weighed.bits(picks[id as usize]));
+        let bits = |picks: &[Candidate]| self.table.sum(|id, weighed| weighed.bits(picks[id as usize]));
         if bits(&together)? < bits(&alone)? {
             return Ok(together);
         }
-        self.forget_loans();
+        self.forget_references();
         Ok(alone)
     }
 
@@ -187,10 +189,10 @@ impl<'a> GridSearch<'a> {
         floor: f64,
         mut near: Option<u32>,
         advance: &mut dyn FnMut(u64),
-    ) -> io::Result<(u32, Vec<Rung>)> {
+    ) -> io::Result<(u32, Vec<Candidate>)> {
         let allowed = self.allowance(self.active_voxels, psnr);
         loop {
-            let span = trace::span("search");
+            let span = profile::span("search");
             let step = first_step(near, |step| {
                 Ok(self.squares_at(step)? <= allowed
                     && !(self.may_vanish && self.is_nothing(&self.picks(step)?)))
@@ -223,7 +225,7 @@ impl<'a> GridSearch<'a> {
 
     /// The last brick that was made finer may have been a large one: where what it left over suffices for others to be
     /// coarser, they are, least loss for a bit first.
-    fn spend_slack(&self, picks: &mut [Rung], allowed: f64, step: u32) -> io::Result<()> {
+    fn spend_slack(&self, picks: &mut [Candidate], allowed: f64, step: u32) -> io::Result<()> {
         let coarser = self.picks(step.saturating_sub(SLACK_STEPS))?;
         let (before, mut squares) = (picks.to_vec(), self.squares(picks)?);
         for Switch { brick, squares: [coarse, fine], .. } in
@@ -243,9 +245,9 @@ impl<'a> GridSearch<'a> {
 
     /// Finds out which bricks had better borrow, were λ what it is at `step` and every brick coded as in `picks`. A brick
     /// lends or borrows, and one that lends keeps the codec it has.
-    pub(super) fn find_loans(
+    pub(super) fn find_references(
         &mut self,
-        picks: &[Rung],
+        picks: &[Candidate],
         step: u32,
         advance: &mut dyn FnMut(u64),
     ) -> io::Result<()> {
@@ -258,52 +260,61 @@ impl<'a> GridSearch<'a> {
         }
         // Who may borrow, and of those who has texels that others can use.
         let whole: Vec<bool> = (0..picks.len() as u32).map(|id| self.encodings.is_whole(id)).collect();
-        let borrows = |id: u32| whole[id as usize] && compared[id as usize] != Rung::Empty;
+        let borrows = |id: u32| whole[id as usize] && compared[id as usize] != Candidate::Empty;
         let lends = |id: u32| borrows(id).then(|| KeptCodec::of(compared[id as usize].codec())).flatten();
         let (table, least_step) = (&self.table, &self.least_step);
-        let gain = |id: u32, weighed: Weighed, loan: &Loan| {
+        let gain = |id: u32, weighed: Weighed, reference: &TexelReference| {
             let lambda = lambda(step.max(least_step[id as usize].into()));
             let own = picks[id as usize];
             let own = weighed.distortion(own) + lambda * weighed.bits(own);
-            own - weighed.borrowed(loan) - lambda * weighed.bits(Rung::Borrowed)
+            own - weighed.borrowed(reference) - lambda * weighed.bits(Candidate::Borrowed)
         };
         // A fifth of the bricks has an offer worth taking.
-        let mut order: Vec<(f64, u32, Loan)> = Vec::new();
-        loans(&self.encodings, self.tree, borrows, lends, |ids, loans| {
-            for ((&id, choices), loans) in ids.iter().zip(&table.read(ids)?).zip(loans) {
-                let as_compared = |loan: &Loan| picks[loan.lender as usize] == compared[loan.lender as usize];
+        let mut order: Vec<(f64, u32, TexelReference)> = Vec::new();
+        texel_references(&self.encodings, self.tree, borrows, lends, |ids, texel_references| {
+            for ((&id, choices), texel_references) in ids.iter().zip(&table.read(ids)?).zip(texel_references)
+            {
+                let as_compared = |reference: &TexelReference| {
+                    picks[reference.referenced as usize] == compared[reference.referenced as usize]
+                };
                 let weighed = table.weighed(id, choices);
-                let offers = loans.into_iter().filter(as_compared);
-                let offers = offers.map(|loan| (gain(id, weighed, &loan), id, loan));
+                let offers = texel_references.into_iter().filter(as_compared);
+                let offers = offers.map(|reference| (gain(id, weighed, &reference), id, reference));
                 order.extend(offers.filter(|(gain, ..)| *gain > 0.0));
             }
             Ok(())
         })?;
         order.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-        for (_, id, loan) in order {
-            let (lender, table) = (loan.lender, &mut self.table);
-            if table.loan(id).is_none() && self.lends[id as usize].is_none() && table.loan(lender).is_none() {
-                table.lend(id, loan);
-                self.lends[lender as usize] = Some(picks[lender as usize]);
+        for (_, id, reference) in order {
+            let (referenced, table) = (reference.referenced, &mut self.table);
+            if table.reference(id).is_none()
+                && self.lends[id as usize].is_none()
+                && table.reference(referenced).is_none()
+            {
+                table.add_reference(id, reference);
+                self.lends[referenced as usize] = Some(picks[referenced as usize]);
             }
         }
         Ok(())
     }
 
-    pub(super) fn forget_loans(&mut self) {
-        self.table.forget_loans();
+    pub(super) fn forget_references(&mut self) {
+        self.table.forget_references();
         self.lends.fill(None);
     }
 
-    pub(super) fn within(&mut self, bound: f64, advance: &mut dyn FnMut(u64)) -> io::Result<Vec<Rung>> {
+    pub(super) fn within(&mut self, bound: f64, advance: &mut dyn FnMut(u64)) -> io::Result<Vec<Candidate>> {
         let bound = (bound - self.source_rounding).max(0.0);
-        let fits = |cost: &Cost| cost.norm.is_finite() && f64::from(cost.max) <= bound;
+        let fits = |cost: &Cost| cost.error_l2.is_finite() && f64::from(cost.max) <= bound;
         loop {
             let mut picks = Vec::with_capacity(self.table.len() as usize);
             for ids in windows(self.table.len(), BLOCK) {
                 let costs = costs(&self.encodings, &ids, &self.bc7_is_tried)?;
                 picks.extend(costs.iter().map(|(costs, _)| {
-                    Rung::ALL.into_iter().find(|&rung| fits(&costs[rung as usize])).unwrap_or(Rung::F32)
+                    Candidate::ALL
+                        .into_iter()
+                        .find(|&candidate| fits(&costs[candidate as usize]))
+                        .unwrap_or(Candidate::F32)
                 }));
             }
             if !self.try_unknown((0..).zip(picks.iter().copied()), advance)? {
@@ -313,12 +324,12 @@ impl<'a> GridSearch<'a> {
     }
 
     /// The PSNR of all frames together.
-    pub(super) fn whole(&self, picks: &[Rung]) -> io::Result<f64> {
+    pub(super) fn whole(&self, picks: &[Candidate]) -> io::Result<f64> {
         Ok(Self::psnr(self.active_voxels, self.squares(picks)?))
     }
 
     /// The squared error of one frame over active voxels.
-    fn frame_squares(&self, frame: &FrameTree, picks: &[Rung]) -> io::Result<f64> {
+    fn frame_squares(&self, frame: &FrameTree, picks: &[Candidate]) -> io::Result<f64> {
         let bricks: Vec<u32> = self.tree.frame_bricks(frame).collect();
         let choices = self.table.read(&bricks)?;
         let square = |(&id, choices)| self.table.weighed(id, choices).active_squares(picks[id as usize]);
@@ -326,7 +337,7 @@ impl<'a> GridSearch<'a> {
     }
 
     /// The PSNR of the worst frame.
-    pub(super) fn worst_frame(&self, picks: &[Rung]) -> io::Result<f64> {
+    pub(super) fn worst_frame(&self, picks: &[Candidate]) -> io::Result<f64> {
         let mut worst = f64::INFINITY;
         for frame in &self.tree.frames {
             let db = Self::psnr(frame.stats.active_leaf_voxels, self.frame_squares(frame, picks)?);
@@ -342,12 +353,12 @@ impl<'a> GridSearch<'a> {
     /// one after `current`, which was not enough. Whether there was such a frame.
     pub(super) fn raise_frames(
         &mut self,
-        picks: &[Rung],
+        picks: &[Candidate],
         floor: f64,
         current: u32,
         advance: &mut dyn FnMut(u64),
     ) -> io::Result<bool> {
-        // All are judged before loans are called in for the sake of some.
+        // All are judged before texel references are called in for the sake of some.
         let mut low: Vec<(usize, f64)> = Vec::new();
         for (f, frame) in self.tree.frames.iter().enumerate() {
             let allowed = self.allowance(frame.stats.active_leaf_voxels, floor);
@@ -396,45 +407,47 @@ impl<'a> GridSearch<'a> {
         Ok(!low.is_empty())
     }
 
-    /// Ends every loan that some bricks, ascending, are part of: they are to become finer, and their texels others.
+    /// Ends every texel reference that some bricks, ascending, are part of: they are to become finer, and their texels others.
     fn call_in_loans(&mut self, bricks: &[u32]) {
         for &id in bricks {
             self.lends[id as usize] = None;
         }
         let lends = &self.lends;
-        self.table.keep_loans(|id, loan| {
-            lends[loan.lender as usize].is_some() && bricks.binary_search(&id).is_err()
+        self.table.keep_references(|id, reference| {
+            lends[reference.referenced as usize].is_some() && bricks.binary_search(&id).is_err()
         });
     }
 
-    pub(super) fn finish(self, picks: &[Rung]) -> io::Result<Allocation> {
+    pub(super) fn finish(self, picks: &[Candidate]) -> io::Result<Allocation> {
         let Self { tree, encodings, bc7_is_tried, table, .. } = self;
-        let loans = table.into_loans();
+        let texel_references = table.into_references();
         let mut allocation = Allocation::new(&tree.scratch, encodings);
         for ids in windows(picks.len() as u32, BLOCK) {
-            let mut norms = Vec::with_capacity(ids.len());
+            let mut error_l2s = Vec::with_capacity(ids.len());
             for (&id, (costs, value)) in ids.iter().zip(costs(&allocation.encodings, &ids, &bc7_is_tried)?) {
-                let rung = picks[id as usize];
-                let (coding, range, norm) = match rung {
-                    Rung::Borrowed => {
-                        let loan = loans[&id];
-                        (Coding::Borrowed(loan.lender), Some(loan.range), loan.norm)
+                let candidate = picks[id as usize];
+                let (coding, range, error_l2) = match candidate {
+                    Candidate::Borrowed => {
+                        let reference = texel_references[&id];
+                        (Coding::Borrowed(reference.referenced), Some(reference.range), reference.error_l2)
                     }
-                    Rung::Empty => (Coding::Empty, None, costs[rung as usize].norm),
-                    Rung::Constant => (Coding::Constant(value), None, costs[rung as usize].norm),
-                    rung => (Coding::Own(rung.codec()), None, costs[rung as usize].norm),
+                    Candidate::Empty => (Coding::Empty, None, costs[candidate as usize].error_l2),
+                    Candidate::Constant => {
+                        (Coding::Constant(value), None, costs[candidate as usize].error_l2)
+                    }
+                    candidate => (Coding::Own(candidate.codec()), None, costs[candidate as usize].error_l2),
                 };
                 allocation.push(coding, range);
-                norms.push(norm);
+                error_l2s.push(error_l2);
             }
-            allocation.norms.put(ids[0], &norms)?;
+            allocation.error_l2s.put(ids[0], &error_l2s)?;
         }
-        allocation.norms.are_known = true;
-        allocation.norms.flush()?;
-        let is_empty = |id: u32| picks[id as usize] == Rung::Empty;
+        allocation.error_l2s.are_known = true;
+        allocation.error_l2s.flush()?;
+        let is_empty = |id: u32| picks[id as usize] == Candidate::Empty;
         for frame in &tree.frames {
             let empty: Vec<u32> = tree.frame_bricks(frame).filter(|&id| is_empty(id)).collect();
-            let squares = allocation.norms.read(&empty)?.into_iter().map(|norm| norm.powi(2));
+            let squares = allocation.error_l2s.read(&empty)?.into_iter().map(|error_l2| error_l2.powi(2));
             allocation.empty_squares.push(squares.sum());
         }
         tree.prune(is_empty)?;
@@ -496,8 +509,8 @@ pub(super) struct Switch {
 pub(super) fn switches(
     grid: u32,
     search: &GridSearch,
-    coarse: &[Rung],
-    fine: &[Rung],
+    coarse: &[Candidate],
+    fine: &[Candidate],
 ) -> io::Result<Vec<Switch>> {
     let differ: Vec<u32> =
         (0..).zip(coarse.iter().zip(fine)).filter(|(_, (a, b))| a != b).map(|(id, _)| id).collect();
@@ -511,7 +524,7 @@ pub(super) fn switches(
                 grid,
                 brick,
                 gain: less / (weighed.bits(to) - weighed.bits(from)),
-                squares: [from, to].map(|rung| weighed.uses() * weighed.active_squares(rung)),
+                squares: [from, to].map(|candidate| weighed.uses() * weighed.active_squares(candidate)),
             });
         }
     }

@@ -3,8 +3,8 @@
 use std::io;
 
 use super::adaptive::Target;
+use super::candidate::Candidate;
 use super::choices::RECORD_BITS;
-use super::rung::Rung;
 use super::search::{GridSearch, Switch, first_step, switches};
 use crate::codec::Codec;
 use crate::pack::tree::NODE_WORDS;
@@ -18,18 +18,18 @@ pub(super) fn at_size(
     limit: u64,
     target: &Target,
     advance: &mut dyn FnMut(u64),
-) -> io::Result<Vec<Vec<Rung>>> {
+) -> io::Result<Vec<Vec<Candidate>>> {
     let fixed = target.fixed_bytes;
     let floors = match target.min_frame_psnr {
         Some(floor) => vec![floor; searches.len()],
         None => floors_at_size(searches, limit, fixed, advance)?,
     };
     let (step, alone) = at_size_above(searches, limit, fixed, &floors, advance)?;
-    let squares = |searches: &[GridSearch], picks: &[Vec<Rung>]| -> io::Result<f64> {
+    let squares = |searches: &[GridSearch], picks: &[Vec<Candidate>]| -> io::Result<f64> {
         searches.iter().zip(picks).map(|(s, picks)| s.squares(picks)).sum()
     };
     for (search, picks) in searches.iter_mut().zip(&alone) {
-        search.find_loans(picks, step, advance)?;
+        search.find_references(picks, step, advance)?;
     }
     let (_, together) = at_size_above(searches, limit, fixed, &floors, advance)?;
     if squares(searches, &together)? < squares(searches, &alone)?
@@ -37,7 +37,7 @@ pub(super) fn at_size(
     {
         return Ok(together);
     }
-    searches.iter_mut().for_each(GridSearch::forget_loans);
+    searches.iter_mut().for_each(GridSearch::forget_references);
     Ok(alone)
 }
 
@@ -55,8 +55,8 @@ fn floors_at_size(
 ) -> io::Result<Vec<f64>> {
     let none = vec![f64::NEG_INFINITY; searches.len()];
     let (_, free) = at_size_above(searches, limit, fixed, &none, advance)?;
-    let end = |(s, p): (&GridSearch, &Vec<Rung>)| Ok((s.worst_frame(p)?, s.whole(p)? - FRAME_MARGIN_DB));
-    let ends = |searches: &[GridSearch], picks: &[Vec<Rung>]| -> io::Result<Vec<(f64, f64)>> {
+    let end = |(s, p): (&GridSearch, &Vec<Candidate>)| Ok((s.worst_frame(p)?, s.whole(p)? - FRAME_MARGIN_DB));
+    let ends = |searches: &[GridSearch], picks: &[Vec<Candidate>]| -> io::Result<Vec<(f64, f64)>> {
         searches.iter().zip(picks).map(end).collect()
     };
     let free = ends(searches, &free)?;
@@ -92,8 +92,8 @@ fn at_size_above(
     fixed: u64,
     floors: &[f64],
     advance: &mut dyn FnMut(u64),
-) -> io::Result<(u32, Vec<Vec<Rung>>)> {
-    let all = |searches: &[GridSearch], step| -> io::Result<Vec<Vec<Rung>>> {
+) -> io::Result<(u32, Vec<Vec<Candidate>>)> {
+    let all = |searches: &[GridSearch], step| -> io::Result<Vec<Vec<Candidate>>> {
         searches.iter().map(|s| s.picks(step)).collect()
     };
     searches.iter_mut().for_each(|s| s.least_step.fill(0));
@@ -142,29 +142,29 @@ fn at_size_above(
 }
 
 /// What tree, masks and texels take together.
-fn bytes(searches: &[GridSearch], picks: &[Vec<Rung>], fixed: u64) -> u64 {
+fn bytes(searches: &[GridSearch], picks: &[Vec<Candidate>], fixed: u64) -> u64 {
     fixed + texel_bytes(&counts(picks)) - saved_bytes(searches, picks)
 }
 
-/// How many bricks each rung has.
-fn counts(picks: &[Vec<Rung>]) -> [u32; Rung::ALL.len()] {
-    let mut counts = [0; Rung::ALL.len()];
-    picks.iter().flatten().for_each(|&rung| counts[rung as usize] += 1);
+/// How many bricks each candidate has.
+fn counts(picks: &[Vec<Candidate>]) -> [u32; Candidate::ALL.len()] {
+    let mut counts = [0; Candidate::ALL.len()];
+    picks.iter().flatten().for_each(|&candidate| counts[candidate as usize] += 1);
     counts
 }
 
 /// What the texture pages of that many bricks take.
-fn texel_bytes(counts: &[u32; Rung::ALL.len()]) -> u64 {
-    let bytes = |rung: Rung| relayout::plan(rung.codec(), counts[rung as usize]).bytes();
-    Rung::ALL.into_iter().filter(|rung| rung.codec() != Codec::Constant).map(bytes).sum()
+fn texel_bytes(counts: &[u32; Candidate::ALL.len()]) -> u64 {
+    let bytes = |candidate: Candidate| relayout::plan(candidate.codec(), counts[candidate as usize]).bytes();
+    Candidate::ALL.into_iter().filter(|candidate| candidate.codec() != Codec::Constant).map(bytes).sum()
 }
 
 /// What empty bricks do without: their records, and nodes of which nothing is left.
-fn saved_bytes(searches: &[GridSearch], picks: &[Vec<Rung>]) -> u64 {
-    let of_grid = |(search, picks): (&GridSearch, &Vec<Rung>)| {
+fn saved_bytes(searches: &[GridSearch], picks: &[Vec<Candidate>]) -> u64 {
+    let of_grid = |(search, picks): (&GridSearch, &Vec<Candidate>)| {
         let tree = &*search.tree;
         let is_empty = |&record: &u32| match tree.record(record).payload() {
-            Payload::Brick(id) => picks[id as usize] == Rung::Empty,
+            Payload::Brick(id) => picks[id as usize] == Candidate::Empty,
             Payload::Constant(_) => false,
         };
         let records = tree.runs.items().iter().filter(|entry| is_empty(entry)).count() as u64;

@@ -2,10 +2,10 @@
 //!
 //! Frames are added in order; what a later frame has in common with an earlier one is not stored
 //! again. Everything here is exact: two things are one only if their bits are. None of it needs voxels: those of a
-//! frame that is known from its [`Outline`] are fetched when someone asks for them.
+//! frame that is known from its [`FrameIndex`] are fetched when someone asks for them.
 
+mod frame_index;
 mod nodes;
-mod outline;
 
 use std::collections::{BTreeSet, HashMap};
 use std::io;
@@ -16,11 +16,11 @@ use rayon::prelude::*;
 use crate::error::Error;
 use crate::volume::{
     Blocks, Brick, BrickPool, CellContent, Child, Constant, Coord, FrameStats, InactiveRule, Interner, List,
-    Mask512, ScratchFolder, Sparse, ValueRange, bits,
+    Mask512, ScratchFolder, SortedMap, ValueRange, bits,
 };
 
+pub use frame_index::{FrameIndex, IndexedBrick, MaskPolicy, Values, texel_mask};
 pub use nodes::{Node, Nodes};
-pub use outline::{BrickOutline, MaskPolicy, Outline, Values, carried};
 
 /// One grid of a sequence, with everything that repeats stored once.
 pub struct SequenceTree {
@@ -47,7 +47,7 @@ pub struct SequenceTree {
     /// Gives the voxels of a frame that was added without.
     fetch: Option<Fetch>,
     /// Of bricks that are no entries by themselves.
-    record_of_brick: Sparse<u32>,
+    record_of_brick: SortedMap<u32>,
     record_of_constant: HashMap<(u32, Option<u32>, InactiveRule), u32>,
 }
 
@@ -172,7 +172,7 @@ impl SequenceTree {
             own_bricks: Vec::new(),
             scratch,
             fetch,
-            record_of_brick: Sparse::default(),
+            record_of_brick: SortedMap::default(),
             record_of_constant: HashMap::new(),
         }
     }
@@ -182,7 +182,7 @@ impl SequenceTree {
     /// # Errors
     /// When the scratch file cannot be written.
     pub fn seal(&mut self) -> io::Result<()> {
-        self.record_of_brick = Sparse::default();
+        self.record_of_brick = SortedMap::default();
         self.record_of_constant = HashMap::new();
         self.nodes.seal()?;
         self.runs.seal();
@@ -194,12 +194,12 @@ impl SequenceTree {
     ///
     /// # Errors
     /// [`DedupError`].
-    pub fn add(&mut self, outline: Outline, voxels: Option<Blocks<Brick>>) -> Result<(), DedupError> {
-        self.check_background(&outline)?;
+    pub fn add(&mut self, frame_index: FrameIndex, voxels: Option<Blocks<Brick>>) -> Result<(), DedupError> {
+        self.check_background(&frame_index)?;
         let first = self.pool.len();
-        let mut cells = Vec::with_capacity(outline.cells.len());
+        let mut cells = Vec::with_capacity(frame_index.cells.len());
         let mut run = Vec::new();
-        for cell in outline.cells {
+        for cell in frame_index.cells {
             let content = match cell.content {
                 CellContent::Constant(constant) => CellRef::Constant(constant),
                 CellContent::Node(children) => {
@@ -209,9 +209,11 @@ impl SequenceTree {
                         places[usize::from(place) >> 6] |= 1 << (place & 63);
                         run.push(match child {
                             Child::Constant(constant) => self.constant_region(constant),
-                            Child::Brick(brick) => {
-                                self.brick(brick, &outline.bricks[brick as usize], &outline.minus)?
-                            }
+                            Child::Brick(brick) => self.brick(
+                                brick,
+                                &frame_index.bricks[brick as usize],
+                                &frame_index.sign_mask,
+                            )?,
                         });
                     }
                     CellRef::Node(self.nodes.intern(&places, self.runs.intern(&run))?)
@@ -223,7 +225,7 @@ impl SequenceTree {
         if let Some(voxels) = voxels {
             self.put_voxels(self.frames.len(), &voxels)?;
         }
-        self.frames.push(FrameTree { roots: outline.roots, cells, stats: outline.stats });
+        self.frames.push(FrameTree { roots: frame_index.roots, cells, stats: frame_index.stats });
         Ok(())
     }
 
@@ -237,7 +239,7 @@ impl SequenceTree {
         Ok(())
     }
 
-    /// The same for voxels that were fetched for an outline from elsewhere: they must be those that it tells of.
+    /// The same for voxels that were fetched for a frame index from elsewhere: they must be those that it tells of.
     fn put_fetched(&mut self, frame: usize, voxels: &Blocks<Brick>) -> io::Result<()> {
         let own: Vec<u32> = self.own_bricks[frame].clone().collect();
         let digests = self.pool.digests(&own)?;
@@ -275,12 +277,12 @@ impl SequenceTree {
     }
 
     /// All frames have one background. A frame without any voxels takes on that of the others.
-    fn check_background(&mut self, outline: &Outline) -> Result<(), DedupError> {
+    fn check_background(&mut self, frame_index: &FrameIndex) -> Result<(), DedupError> {
         let empty = |f: &FrameTree| f.roots.is_empty() && f.cells.is_empty();
-        let (here, before) = (outline.background, self.background);
+        let (here, before) = (frame_index.background, self.background);
         if self.frames.iter().all(empty) {
             self.background = here;
-        } else if here.to_bits() != before.to_bits() && !outline.is_empty() {
+        } else if here.to_bits() != before.to_bits() && !frame_index.is_empty() {
             return Err(DedupError::Background { here, before });
         }
         Ok(())
@@ -304,22 +306,22 @@ impl SequenceTree {
         id
     }
 
-    /// The record of a brick of the frame that is being added, whose signs are among `minus`.
-    fn brick(&mut self, place: u32, outline: &BrickOutline, minus: &[Mask512]) -> io::Result<u32> {
-        let (rule, keeps_mask) = (outline.rule(), outline.keeps_mask());
-        let (range, digest) = match outline.values() {
+    /// The record of a brick of the frame that is being added, whose signs are among `sign_mask`.
+    fn brick(&mut self, place: u32, frame_index: &IndexedBrick, sign_mask: &[Mask512]) -> io::Result<u32> {
+        let (rule, keeps_mask) = (frame_index.rule(), frame_index.keeps_mask());
+        let (range, digest) = match frame_index.values() {
             Values::Constant(value) => {
-                let mask = self.mask(outline, minus);
+                let mask = self.mask(frame_index, sign_mask);
                 return Ok(self.constant_record(value, mask, rule));
             }
             Values::Varied(range, digest) => (range, digest),
         };
-        let (id, is_new) = self.pool.insert(&digest, &outline.active, keeps_mask, place)?;
+        let (id, is_new) = self.pool.insert(&digest, &frame_index.active, keeps_mask, place)?;
         if !is_new {
             return Ok(self.record_of_brick.get(id).unwrap_or(id | PLAIN_BRICK));
         }
         self.brick_ranges.push(range);
-        let mask = self.mask(outline, minus);
+        let mask = self.mask(frame_index, sign_mask);
         if (mask, rule) == (None, InactiveRule::Texel) {
             return Ok(id | PLAIN_BRICK);
         }
@@ -329,10 +331,10 @@ impl SequenceTree {
         Ok(record)
     }
 
-    fn mask(&mut self, outline: &BrickOutline, minus: &[Mask512]) -> Option<u32> {
-        outline.keeps_mask().then(|| match outline.signs() {
-            Some(place) => self.masks.intern(&[outline.active, minus[place]]),
-            None => self.masks.intern(&[outline.active]),
+    fn mask(&mut self, frame_index: &IndexedBrick, sign_mask: &[Mask512]) -> Option<u32> {
+        frame_index.keeps_mask().then(|| match frame_index.signs() {
+            Some(place) => self.masks.intern(&[frame_index.active, sign_mask[place]]),
+            None => self.masks.intern(&[frame_index.active]),
         })
     }
 

@@ -30,7 +30,7 @@ const BASE: Stage = Stage { name: "batch", version: 1, travels: false };
 pub struct GridCache {
     /// The store.
     pub cache: Arc<Cache>,
-    /// For each frame of the grid, the key of its outline.
+    /// For each frame of the grid, the key of its frame index.
     pub frames: Vec<Key>,
 }
 
@@ -118,10 +118,10 @@ impl Batches {
             let part = |id: &u32| tree.pool.place(*id) / BATCH_BRICKS;
             for ids in own.chunk_by(|a, b| part(a) == part(b)) {
                 let base = cache.as_ref().map(|cache| {
-                    let outline = cache.frames[frame].digest();
+                    let frame_index = cache.frames[frame].digest();
                     let range = [sequence.lo, sequence.span].map(f32::to_bits);
                     // The blocks of intel_tex_2, and what is fitted to them, depend on what the machine can do.
-                    Key::new(&BASE, &(outline, part(&ids[0]), range, terms, encoder_isa()))
+                    Key::new(&BASE, &(frame_index, part(&ids[0]), range, terms, encoder_isa()))
                 });
                 all.push(Batch { base, ids: ids[0]..ids[ids.len() - 1] + 1, states: Default::default() });
             }

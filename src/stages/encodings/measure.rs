@@ -9,7 +9,7 @@ const LANES: usize = 8;
 /// A brick to which decoded values are compared.
 pub struct Measure<'a> {
     brick: &'a Brick,
-    carried: &'a Mask512,
+    texel_mask: &'a Mask512,
     /// 1 for voxels that texels give, and for those of them that are active; else 0.
     counts: [f32; BRICK_VOXELS],
     active: [f32; BRICK_VOXELS],
@@ -18,12 +18,12 @@ pub struct Measure<'a> {
 }
 
 impl<'a> Measure<'a> {
-    /// `carried` are the voxels that texels give; `terms` say what must not become of them.
-    pub(super) fn new(brick: &'a Brick, carried: &'a Mask512, terms: &Terms) -> Self {
+    /// `texel_mask` are the voxels that texels give; `terms` say what must not become of them.
+    pub(super) fn new(brick: &'a Brick, texel_mask: &'a Mask512, terms: &Terms) -> Self {
         Self {
             brick,
-            carried,
-            counts: carried.weights(),
+            texel_mask,
+            counts: texel_mask.weights(),
             active: brick.active.weights(),
             sign_matters: terms.sign_matters,
             error_below: terms.error_below.unwrap_or(f64::INFINITY),
@@ -49,7 +49,7 @@ impl<'a> Measure<'a> {
             let values = &self.brick.values;
             let flips =
                 |i: usize| (decoded[i] < 0.0) != (values[i] < 0.0) && f64::from(values[i]).abs() > distance;
-            if self.carried.ones().any(flips) {
+            if self.texel_mask.ones().any(flips) {
                 return Cost::IMPOSSIBLE;
             }
         }
@@ -60,12 +60,12 @@ impl<'a> Measure<'a> {
         // Rounded up, because a bound is what it is compared with.
         let max = if f64::from(max as f32) < max { (max as f32).next_up() } else { max as f32 };
         let root = |lanes: [f64; LANES]| lanes.iter().sum::<f64>().sqrt();
-        Cost { norm: root(squares), active_norm: root(active), max }
+        Cost { error_l2: root(squares), active_error_l2: root(active), max }
     }
 }
 
 /// The mean of the voxels that texels would give.
-pub(super) fn mean(brick: &Brick, carried: &Mask512) -> f32 {
-    let sum: f64 = carried.ones().map(|i| f64::from(brick.values[i])).sum();
-    (sum / f64::from(carried.count().max(1))) as f32
+pub(super) fn mean(brick: &Brick, texel_mask: &Mask512) -> f32 {
+    let sum: f64 = texel_mask.ones().map(|i| f64::from(brick.values[i])).sum();
+    (sum / f64::from(texel_mask.count().max(1))) as f32
 }

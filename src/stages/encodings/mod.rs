@@ -2,8 +2,8 @@
 //! choose a codec is what goes into the pack, and what an earlier build made is taken from the cache.
 
 mod cached;
-mod kept;
 mod measure;
+mod spilled;
 
 use std::io;
 use std::time::{Duration, Instant};
@@ -13,35 +13,36 @@ use half::slice::HalfFloatSliceExt;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use super::dedup::{SequenceTree, carried};
+use super::dedup::{SequenceTree, texel_mask};
 use crate::cache::pods;
 use crate::codec::{BATCH, BrickRange, Codec, SequenceRange, Texels, decode, encode, spread};
 use crate::interrupt;
+use crate::profile;
 use crate::settings::RangeMode;
-use crate::trace;
 use crate::volume::{BRICK_VOXELS, BRICKS_IN_FLIGHT, Brick, InactiveRule, Mask512};
 use cached::Batches;
 pub use cached::{Batch, GridCache};
-use kept::{Kept, Note};
 pub use measure::Measure;
+use spilled::{Note, Spilled};
 
 /// What one codec does to one brick.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Cost {
     /// Root of the squared error over the voxels that texels give; infinite where the codec is out of the
     /// question.
-    pub norm: f64,
+    pub error_l2: f64,
     /// The same over active voxels.
-    pub active_norm: f64,
+    pub active_error_l2: f64,
     /// The largest error that an engine can read, on any GPU.
     pub max: f32,
 }
 
 impl Cost {
     /// No error at all.
-    pub const NONE: Self = Self { norm: 0.0, active_norm: 0.0, max: 0.0 };
+    pub const NONE: Self = Self { error_l2: 0.0, active_error_l2: 0.0, max: 0.0 };
     /// More error than any.
-    pub const IMPOSSIBLE: Self = Self { norm: f64::INFINITY, active_norm: f64::INFINITY, max: f32::INFINITY };
+    pub const IMPOSSIBLE: Self =
+        Self { error_l2: f64::INFINITY, active_error_l2: f64::INFINITY, max: f32::INFINITY };
 }
 
 /// What a constant brick's value keeps small.
@@ -177,7 +178,7 @@ pub struct Encodings {
     pub sequence: SequenceRange,
     terms: Terms,
     rules: Vec<InactiveRule>,
-    kept: [Kept; Kind::ALL.len()],
+    kept: [Spilled; Kind::ALL.len()],
     batches: Batches,
     saved: Instant,
 }
@@ -193,7 +194,7 @@ impl Encodings {
         let batches = Batches::new(tree, cache, &sequence, &terms);
         Some(Self {
             rules: tree.brick_rules(),
-            kept: Kind::ALL.map(|kind| Kept::new(&tree.scratch, kind)),
+            kept: Kind::ALL.map(|kind| Spilled::new(&tree.scratch, kind)),
             batches,
             saved: Instant::now(),
             sequence,
@@ -251,15 +252,15 @@ impl Encodings {
     /// A brick as its texels shall be.
     pub fn prepare(&self, tree: &SequenceTree, id: u32, brick: &Brick) -> Texels {
         let (rule, range) = (self.rules[id as usize], tree.brick_ranges[id]);
-        Texels::new(brick, carried(&brick.active, rule), (range.min, range.max), self.range(tree, id))
+        Texels::new(brick, texel_mask(&brick.active, rule), (range.min, range.max), self.range(tree, id))
     }
 
-    /// Measures what decoded values cost a brick whose texels give the voxels in `carried`.
-    pub fn measure<'a>(&self, brick: &'a Brick, carried: &'a Mask512) -> Measure<'a> {
-        Measure::new(brick, carried, &self.terms)
+    /// Measures what decoded values cost a brick whose texels give the voxels in `texel_mask`.
+    pub fn measure<'a>(&self, brick: &'a Brick, texel_mask: &'a Mask512) -> Measure<'a> {
+        Measure::new(brick, texel_mask, &self.terms)
     }
 
-    fn kept(&self, kind: Kind) -> &Kept {
+    fn kept(&self, kind: Kind) -> &Spilled {
         &self.kept[kind.index()]
     }
 
@@ -309,7 +310,7 @@ impl Encodings {
     }
 
     fn make_batch(&self, tree: &SequenceTree, ids: &[u32], kinds: &[Kind]) -> io::Result<Vec<Made>> {
-        let _span = trace::span("encode");
+        let _span = profile::span("encode");
         let bricks = &tree.pool.read(ids)?;
         let texels: Vec<Texels> = ids.iter().zip(bricks).map(|(&id, b)| self.prepare(tree, id, b)).collect();
         let each = || ids.iter().zip(bricks).zip(&texels);
@@ -326,10 +327,10 @@ impl Encodings {
     fn make_plain(&self, tree: &SequenceTree, id: u32, brick: &Brick, texels: &Texels) -> Plain {
         let range = tree.brick_ranges[id];
         let value = match self.terms.aim {
-            ConstantAim::Squares => measure::mean(brick, &texels.carried),
+            ConstantAim::Squares => measure::mean(brick, &texels.texel_mask),
             ConstantAim::Max => f64::midpoint(range.min.into(), range.max.into()) as f32,
         };
-        let measure = self.measure(brick, &texels.carried);
+        let measure = self.measure(brick, &texels.texel_mask);
         // Values just past the greatest half would round to it, but the codec refuses them.
         let f16 = match brick.values.iter().all(|v| v.abs() <= f16::MAX.to_f32()) {
             true => {
@@ -355,7 +356,7 @@ impl Encodings {
         let note = |(((brick, texels), bytes), &axis): (((&Brick, &Texels), &[u8]), &u8)| {
             let decoded = decode(codec, bytes, axis, &self.sequence, texels.range);
             let spread = spread(codec, bytes, &self.sequence, texels.range);
-            Note::new(self.measure(brick, &texels.carried).of(&decoded, Some(&spread)), axis.into())
+            Note::new(self.measure(brick, &texels.texel_mask).of(&decoded, Some(&spread)), axis.into())
         };
         Made { notes: each.map(note).collect(), texels: encoded.bytes }
     }
@@ -366,7 +367,7 @@ impl Encodings {
 
     /// Sees to it that what was kept can be read.
     fn flush(&mut self) -> io::Result<()> {
-        self.kept.iter_mut().try_for_each(Kept::flush)
+        self.kept.iter_mut().try_for_each(Spilled::flush)
     }
 }
 

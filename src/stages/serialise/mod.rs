@@ -196,7 +196,7 @@ fn grid_records(grids: &[GridInput]) -> io::Result<Vec<GridRecord>> {
             fps: g.fps,
             active_min: active.map_or(0.0, |r| r.min),
             active_max: active.map_or(0.0, |r| r.max),
-            codec_norms: codec_norms(g)?,
+            codec_error_l2s: codec_error_l2s(g)?,
         };
         name_offset += record.name_bytes;
         first_frame += record.frames;
@@ -229,7 +229,7 @@ fn frame_slabs(grids: &[GridInput], layout: &Layout) -> Vec<Vec<Vec<u32>>> {
 }
 
 /// What each codec cost a grid: the root of the squared error of its bricks over all frames, by tag.
-fn codec_norms(grid: &GridInput) -> io::Result<[f32; Codec::WITH_TEXELS.len() + 1]> {
+fn codec_error_l2s(grid: &GridInput) -> io::Result<[f32; Codec::WITH_TEXELS.len() + 1]> {
     let mut squares = [0.0; Codec::WITH_TEXELS.len() + 1];
     for frame in &grid.tree.frames {
         for (id, square) in squares_of(grid, frame)? {
@@ -243,8 +243,8 @@ fn codec_norms(grid: &GridInput) -> io::Result<[f32; Codec::WITH_TEXELS.len() + 
 /// The squared errors of a frame's bricks.
 fn squares_of(grid: &GridInput, frame: &FrameTree) -> io::Result<impl Iterator<Item = (u32, f64)>> {
     let ids: Vec<u32> = grid.tree.frame_bricks(frame).collect();
-    let norms = grid.allocation().norms.read(&ids)?;
-    Ok(ids.into_iter().zip(norms.into_iter().map(|norm| norm.powi(2))))
+    let error_l2s = grid.allocation().error_l2s.read(&ids)?;
+    Ok(ids.into_iter().zip(error_l2s.into_iter().map(|error_l2| error_l2.powi(2))))
 }
 
 /// Fills in what encoding cost each frame.
@@ -255,7 +255,7 @@ fn set_errors(frames: &mut [FrameRecord], grids: &[GridInput]) -> io::Result<()>
         for (tree, frame) in grid.tree.frames.iter().zip(&mut frames) {
             let squares: f64 = squares_of(grid, tree)?.map(|(_, square)| square).sum();
             let squares = squares + empty.next().copied().unwrap_or(0.0);
-            frame.error_norm = squares.sqrt();
+            frame.error_l2 = squares.sqrt();
         }
     }
     Ok(())
@@ -274,7 +274,7 @@ fn frame_tables(grids: &[GridInput], slabs: &[Vec<Vec<u32>>]) -> (Vec<FrameRecor
                 chunks: slabs.len() as u32,
                 bbox: frame.stats.bbox.to_array(),
                 reserved: 0,
-                error_norm: 0.0,
+                error_l2: 0.0,
                 leaves: frame.stats.leaves,
                 active_voxels: frame.stats.active_voxels,
                 transform: input.transform,

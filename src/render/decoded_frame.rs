@@ -9,18 +9,18 @@ use crate::volume::{
 };
 
 /// A frame as nested constants and bricks of values.
-pub struct Field {
+pub struct DecodedFrame {
     /// The value outside everything.
     pub background: f32,
     /// The box of everything that is not background, in whole bricks; empty if there is nothing.
     pub bounds: CoordBox,
     roots: HashMap<Coord, Constant>,
     cells: HashMap<Coord, Cell>,
-    bricks: Vec<FieldBrick>,
+    bricks: Vec<DecodedBrick>,
 }
 
 /// 512 voxels of a frame.
-pub struct FieldBrick {
+pub struct DecodedBrick {
     /// Their values, x slowest.
     pub values: Box<[f32; BRICK_VOXELS]>,
     /// How far a GPU's values may be from these: 0 but for BC4, whose blocks each GPU interpolates in its own way.
@@ -62,10 +62,10 @@ pub enum Content<'a> {
     /// One value.
     Constant(Constant),
     /// 512 voxels.
-    Brick(&'a FieldBrick),
+    Brick(&'a DecodedBrick),
 }
 
-impl Field {
+impl DecodedFrame {
     fn empty(background: f32) -> Self {
         Self {
             background,
@@ -95,7 +95,7 @@ impl Field {
                                 let brick = bricks[i as usize].take().expect("each brick is named once");
                                 field.put_brick(
                                     origin,
-                                    FieldBrick { values: Box::new(brick.values), uncertainty: 0.0 },
+                                    DecodedBrick { values: Box::new(brick.values), uncertainty: 0.0 },
                                 );
                             }
                         }
@@ -125,7 +125,7 @@ impl Field {
                 Ok(brick) => {
                     let is_bc4 = record.codec == Codec::Bc4;
                     let uncertainty = if is_bc4 { BC4_UNCERTAINTY * span(&brick.values[..]) } else { 0.0 };
-                    field.put_brick(origin, FieldBrick { values: brick.values, uncertainty });
+                    field.put_brick(origin, DecodedBrick { values: brick.values, uncertainty });
                 }
                 Err(e) => result = Err(e),
             },
@@ -159,7 +159,7 @@ impl Field {
         constants.push(constant);
     }
 
-    fn put_brick(&mut self, origin: Coord, brick: FieldBrick) {
+    fn put_brick(&mut self, origin: Coord, brick: DecodedBrick) {
         let number = self.bricks.len() as u32 + 1;
         *self.place(origin).0 = number;
         self.bricks.push(brick);

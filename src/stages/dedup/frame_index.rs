@@ -26,7 +26,7 @@ pub enum MaskPolicy {
 
 /// One frame of one grid without its voxels.
 #[derive(Clone, Serialize, Deserialize)]
-pub struct Outline {
+pub struct FrameIndex {
     /// The value outside everything.
     pub background: f32,
     /// Constant 4096³ regions.
@@ -35,10 +35,10 @@ pub struct Outline {
     pub cells: Vec<Cell>,
     /// The bricks that the cells name, in the order in which they name them.
     #[serde(with = "pods")]
-    pub bricks: Vec<BrickOutline>,
+    pub bricks: Vec<IndexedBrick>,
     /// For those whose rule is [`InactiveRule::Sign`], in that order, the voxels at minus the background.
     #[serde(with = "pods")]
-    pub minus: Vec<Mask512>,
+    pub sign_mask: Vec<Mask512>,
     /// The source's counts.
     pub stats: FrameStats,
 }
@@ -46,7 +46,7 @@ pub struct Outline {
 /// A brick without its voxels: what can be found out about it without knowing the others.
 #[derive(Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
-pub struct BrickOutline {
+pub struct IndexedBrick {
     /// Which voxels of the source are active.
     pub active: Mask512,
     /// [`BrickPool::digest`]; nothing where all values are one.
@@ -54,8 +54,8 @@ pub struct BrickOutline {
     /// The range of the values that its texels have to give.
     min: f32,
     max: f32,
-    /// The place of its mask in [`Outline::minus`], if it has one.
-    minus: u32,
+    /// The place of its mask in [`FrameIndex::sign_mask`], if it has one.
+    sign_mask: u32,
     /// An [`InactiveRule`] in the lowest bits, and those below.
     flags: u32,
 }
@@ -74,20 +74,20 @@ pub enum Values {
     Varied(ValueRange, [u8; 32]),
 }
 
-impl Outline {
+impl FrameIndex {
     /// Takes the voxels away from a frame: gives them apart, each brick with whether it keeps its mask.
     pub fn split(flat: Flattened, policy: MaskPolicy) -> (Self, Blocks<Brick>) {
         let Flattened { frame: FlatFrame { roots, cells, bricks: mut voxels, stats }, background } = flat;
         let blocks = voxels.blocks_mut().par_iter_mut();
         let outlined =
-            blocks.flat_map_iter(|b| b.iter_mut().map(|b| BrickOutline::new(b, background, policy)));
-        let (mut bricks, signs): (Vec<BrickOutline>, Vec<Option<Mask512>>) = outlined.unzip();
-        let mut minus = Vec::new();
+            blocks.flat_map_iter(|b| b.iter_mut().map(|b| IndexedBrick::new(b, background, policy)));
+        let (mut bricks, signs): (Vec<IndexedBrick>, Vec<Option<Mask512>>) = outlined.unzip();
+        let mut sign_mask = Vec::new();
         for (brick, signs) in bricks.iter_mut().zip(signs) {
-            brick.minus = minus.len() as u32;
-            minus.extend(signs);
+            brick.sign_mask = sign_mask.len() as u32;
+            sign_mask.extend(signs);
         }
-        (Self { background, roots, cells, bricks, minus, stats }, voxels)
+        (Self { background, roots, cells, bricks, sign_mask, stats }, voxels)
     }
 
     /// Whether what it says is of one piece: a frame that was read is, and what comes from elsewhere has to be looked
@@ -109,7 +109,7 @@ impl Outline {
                 in_order && numbered && children.last().is_none_or(|(place, _)| *place < 4096)
             }
         }) && next as usize == self.bricks.len()
-            && self.bricks.iter().all(|brick| brick.is_sound(self.minus.len()))
+            && self.bricks.iter().all(|brick| brick.is_sound(self.sign_mask.len()))
             && self.cells.is_sorted_by(|a, b| a.origin < b.origin)
             && self.cells.iter().all(|cell| cell.origin.is_aligned(CELL_DIM))
             && self.roots.iter().all(|(origin, _)| origin.is_aligned(ROOT_DIM))
@@ -122,7 +122,7 @@ impl Outline {
     }
 }
 
-impl BrickOutline {
+impl IndexedBrick {
     /// Whether its active mask has to be kept.
     pub fn keeps_mask(&self) -> bool {
         self.flags & KEEPS_MASK != 0
@@ -141,12 +141,12 @@ impl BrickOutline {
         }
     }
 
-    /// The place of its signs in [`Outline::minus`], if it has some.
+    /// The place of its signs in [`FrameIndex::sign_mask`], if it has some.
     pub fn signs(&self) -> Option<usize> {
-        (self.rule() == InactiveRule::Sign).then_some(self.minus as usize)
+        (self.rule() == InactiveRule::Sign).then_some(self.sign_mask as usize)
     }
 
-    fn is_sound(&self, minus: usize) -> bool {
+    fn is_sound(&self, sign_mask: usize) -> bool {
         let in_order = match self.values() {
             Values::Constant(_) => true,
             Values::Varied(range, _) => {
@@ -154,12 +154,12 @@ impl BrickOutline {
             }
         };
         in_order
-            && self.signs().is_none_or(|place| place < minus)
+            && self.signs().is_none_or(|place| place < sign_mask)
             && (self.keeps_mask() || self.rule() == InactiveRule::Texel)
     }
 
     fn new(brick: &mut Brick, background: f32, policy: MaskPolicy) -> (Self, Option<Mask512>) {
-        let (rule, minus) = brick.inactive_rule(background);
+        let (rule, sign_mask) = brick.inactive_rule(background);
         let drop = match policy {
             MaskPolicy::Keep => false,
             MaskPolicy::DropWhereBackground => true,
@@ -167,24 +167,24 @@ impl BrickOutline {
         };
         brick.keeps_mask = !(drop && rule == InactiveRule::Background);
         let rule = if brick.keeps_mask { rule } else { InactiveRule::Texel };
-        let mut outline = Self { active: brick.active, ..Self::zeroed() };
-        outline.flags = rule as u32 | if brick.keeps_mask { KEEPS_MASK } else { 0 };
-        match values(brick, &carried(&brick.active, rule), background) {
+        let mut frame_index = Self { active: brick.active, ..Self::zeroed() };
+        frame_index.flags = rule as u32 | if brick.keeps_mask { KEEPS_MASK } else { 0 };
+        match values(brick, &texel_mask(&brick.active, rule), background) {
             Values::Constant(value) => {
-                outline.flags |= IS_CONSTANT;
-                (outline.min, outline.max) = (value, value);
+                frame_index.flags |= IS_CONSTANT;
+                (frame_index.min, frame_index.max) = (value, value);
             }
             Values::Varied(range, digest) => {
-                (outline.min, outline.max, outline.digest) = (range.min, range.max, digest);
+                (frame_index.min, frame_index.max, frame_index.digest) = (range.min, range.max, digest);
             }
         }
-        (outline, (rule == InactiveRule::Sign).then_some(minus))
+        (frame_index, (rule == InactiveRule::Sign).then_some(sign_mask))
     }
 }
 
-fn values(brick: &Brick, carried: &Mask512, background: f32) -> Values {
-    let Some((min, max)) = brick.range_over(carried) else { return Values::Constant(background) };
-    let mut bits = carried.ones().map(|i| brick.values[i].to_bits());
+fn values(brick: &Brick, texel_mask: &Mask512, background: f32) -> Values {
+    let Some((min, max)) = brick.range_over(texel_mask) else { return Values::Constant(background) };
+    let mut bits = texel_mask.ones().map(|i| brick.values[i].to_bits());
     // 0 and −0 compare equal but are not the same bits.
     let first = bits.next();
     if min == max && bits.all(|b| Some(b) == first) {
@@ -194,7 +194,7 @@ fn values(brick: &Brick, carried: &Mask512, background: f32) -> Values {
 }
 
 /// The voxels whose values texels have to give: all but those that a rule gives.
-pub fn carried(active: &Mask512, rule: InactiveRule) -> Mask512 {
+pub fn texel_mask(active: &Mask512, rule: InactiveRule) -> Mask512 {
     match rule {
         InactiveRule::Background | InactiveRule::MinusBackground | InactiveRule::Sign => *active,
         InactiveRule::Texel => Mask512::ALL,

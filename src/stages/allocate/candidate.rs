@@ -4,7 +4,7 @@ use crate::codec::Codec;
 
 /// One of the ways.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Rung {
+pub(super) enum Candidate {
     /// Not at all: background, without a record.
     Empty,
     Constant,
@@ -17,7 +17,7 @@ pub(super) enum Rung {
     F32,
 }
 
-impl Rung {
+impl Candidate {
     /// By ascending bits.
     pub const ALL: [Self; 8] = [
         Self::Empty,

@@ -21,9 +21,9 @@ use serde::{Deserialize, Serialize};
 
 use crate::cache::{Key, Stage, pods};
 use crate::codec::{BrickRange, SequenceRange, decode};
+use crate::profile;
 use crate::stages::dedup::SequenceTree;
 use crate::stages::encodings::{Batch, Cost, Encodings, KeptCodec, Tried};
-use crate::trace;
 use crate::volume::{BRICK_VOXELS, Brick, Mask512};
 
 const STAGE: Stage = Stage { name: "share", version: 2, travels: true };
@@ -32,7 +32,7 @@ const STAGE: Stage = Stage { name: "share", version: 2, travels: true };
 const LEAST_NEAR: usize = 128;
 /// Borrowers that a thread compares at a time. 32 × 6,144 similarities are 0.8 MB.
 const ROWS: usize = 32;
-/// Borrowers of batches that are compared side by side, so that all cores have work to the end. The lenders of a batch
+/// Borrowers of batches that are compared side by side, so that all cores have work to the end. The referenced bricks of a batch
 /// more to either side are in memory, 2.4 KB each.
 const AT_ONCE: usize = 640;
 /// Lenders that are compared voxel by voxel.
@@ -42,25 +42,25 @@ const COARSE: usize = BRICK_VOXELS / 8;
 
 /// What a brick would be with another's texels.
 #[derive(Clone, Copy)]
-pub(super) struct Loan {
+pub(super) struct TexelReference {
     /// The brick whose texels they are.
-    pub lender: u32,
+    pub referenced: u32,
     /// The range that suits them best.
     pub range: BrickRange,
-    /// What it does to the borrower: [`Cost::norm`],
-    pub norm: f64,
-    /// and [`Cost::active_norm`].
-    pub active_norm: f64,
+    /// What it does to the borrower: [`Cost::error_l2`],
+    pub error_l2: f64,
+    /// and [`Cost::active_error_l2`].
+    pub active_error_l2: f64,
 }
 
-/// A [`Loan`] by its lender's place among the lenders that were compared, and its range as a record has it.
+/// A [`TexelReference`] by its referenced brick's place among the referenced bricks that were compared, and its range as a record has it.
 #[derive(Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
 struct Offer {
-    lender: u32,
+    referenced: u32,
     range: u32,
-    norm: f64,
-    active_norm: f64,
+    error_l2: f64,
+    active_error_l2: f64,
 }
 
 /// What was offered to the borrowers of a batch.
@@ -92,14 +92,14 @@ const BATCHES: usize = 32;
 
 /// Visits the bricks that may borrow, ascending and some at a time, each with the nearest of those that lend, the
 /// closest first.
-pub(super) fn loans(
+pub(super) fn texel_references(
     encodings: &Encodings,
     tree: &mut SequenceTree,
     borrows: impl Fn(u32) -> bool,
     lends: impl Fn(u32) -> Option<KeptCodec>,
-    mut visit: impl FnMut(&[u32], Vec<Vec<Loan>>) -> io::Result<()>,
+    mut visit: impl FnMut(&[u32], Vec<Vec<TexelReference>>) -> io::Result<()>,
 ) -> io::Result<()> {
-    let lenders = |ids: &Range<u32>| -> Vec<(u32, KeptCodec)> {
+    let referenced_bricks = |ids: &Range<u32>| -> Vec<(u32, KeptCodec)> {
         ids.clone().filter_map(|id| Some((id, lends(id)?))).collect()
     };
     let mut near = Near::default();
@@ -111,7 +111,7 @@ pub(super) fn loans(
             Comparison {
                 batch,
                 borrowers: encodings.batches()[batch].ids.clone().filter(|&id| borrows(id)).collect(),
-                lenders: batches.iter().flat_map(|batch| lenders(&batch.ids)).collect(),
+                referenced_bricks: batches.iter().flat_map(|batch| referenced_bricks(&batch.ids)).collect(),
                 around,
             }
         };
@@ -134,7 +134,7 @@ pub(super) fn loans(
             if known[next].is_none() {
                 let unknown = known[next..].iter().take_while(|known| known.is_none()).count();
                 let group = together(&comparisons[next..next + unknown]);
-                near.move_to(encodings, tree, group, &lenders)?;
+                near.move_to(encodings, tree, group, &referenced_bricks)?;
                 for (i, offers) in (next..).zip(nearest(encodings, tree, group, &near)?) {
                     if let Some((cache, key)) = encodings.cache().zip(keys[i]) {
                         cache.put(&key, &offers);
@@ -143,7 +143,7 @@ pub(super) fn loans(
                 }
             }
             let offers = known[next].take().expect("what was not known was made");
-            visit(&comparisons[next].borrowers, comparisons[next].loans(offers))?;
+            visit(&comparisons[next].borrowers, comparisons[next].texel_references(offers))?;
             next += 1;
         }
     }
@@ -160,13 +160,13 @@ fn together(comparisons: &[Comparison]) -> &[Comparison] {
     &comparisons[..comparisons.iter().take_while(fits).count().max(1)]
 }
 
-/// The borrowers of a batch, and the lenders that they are compared with.
+/// The borrowers of a batch, and the referenced bricks that they are compared with.
 struct Comparison {
     batch: usize,
-    /// The batches that the lenders are in.
+    /// The batches that the referenced bricks are in.
     around: Range<usize>,
     borrowers: Vec<u32>,
-    lenders: Vec<(u32, KeptCodec)>,
+    referenced_bricks: Vec<(u32, KeptCodec)>,
 }
 
 impl Comparison {
@@ -177,21 +177,23 @@ impl Comparison {
                 && offers.counts.iter().map(|count| usize::from(*count)).sum::<usize>() == offers.all.len()
                 && offers.all.iter().all(|offer| {
                     let extent = BrickRange::from_word(offer.range).extent;
-                    (offer.lender as usize) < self.lenders.len() && extent.is_finite() && extent > f16::ZERO
+                    (offer.referenced as usize) < self.referenced_bricks.len()
+                        && extent.is_finite()
+                        && extent > f16::ZERO
                 })
         };
         encodings.cache()?.get(&key?).filter(is_sound)
     }
 
     /// What is offered to each borrower.
-    fn loans(&self, offers: Offers) -> Vec<Vec<Loan>> {
-        let loan = |offer: Offer| Loan {
-            lender: self.lenders[offer.lender as usize].0,
+    fn texel_references(&self, offers: Offers) -> Vec<Vec<TexelReference>> {
+        let reference = |offer: Offer| TexelReference {
+            referenced: self.referenced_bricks[offer.referenced as usize].0,
             range: BrickRange::from_word(offer.range),
-            norm: offer.norm,
-            active_norm: offer.active_norm,
+            error_l2: offer.error_l2,
+            active_error_l2: offer.active_error_l2,
         };
-        let mut all = offers.all.into_iter().map(loan);
+        let mut all = offers.all.into_iter().map(reference);
         offers.counts.iter().map(|&count| all.by_ref().take(count.into()).collect()).collect()
     }
 
@@ -205,10 +207,14 @@ impl Comparison {
         let borrowers: Vec<(u32, u64)> =
             self.borrowers.iter().zip(actives).map(|(&id, active)| (place(id), active)).collect();
         // Places are told from each other by the batch that they are in.
-        let counts: Vec<usize> = batches.iter().map(|batch| count(&self.lenders, &batch.ids)).collect();
-        let lenders: Vec<(u32, KeptCodec)> =
-            self.lenders.iter().map(|&(id, codec)| (place(id), codec)).collect();
-        Ok(Some(Key::new(&STAGE, &(keys, self.batch - self.around.start, borrowers, counts, lenders))))
+        let counts: Vec<usize> =
+            batches.iter().map(|batch| count(&self.referenced_bricks, &batch.ids)).collect();
+        let referenced_bricks: Vec<(u32, KeptCodec)> =
+            self.referenced_bricks.iter().map(|&(id, codec)| (place(id), codec)).collect();
+        Ok(Some(Key::new(
+            &STAGE,
+            &(keys, self.batch - self.around.start, borrowers, counts, referenced_bricks),
+        )))
     }
 }
 
@@ -228,58 +234,58 @@ fn around(batches: &[Batch], batch: usize) -> Range<usize> {
     batch - before..batch + 1 + reach(&mut batches[batch + 1..].iter())
 }
 
-/// How many of some lenders, ascending, are in a range.
-fn count(lenders: &[(u32, KeptCodec)], ids: &Range<u32>) -> usize {
-    let before = |end: u32| lenders.partition_point(|(id, _)| *id < end);
+/// How many of some referenced bricks, ascending, are in a range.
+fn count(referenced_bricks: &[(u32, KeptCodec)], ids: &Range<u32>) -> usize {
+    let before = |end: u32| referenced_bricks.partition_point(|(id, _)| *id < end);
     before(ids.end) - before(ids.start)
 }
 
-/// The lenders of the batches that are being compared.
+/// The referenced bricks of the batches that are being compared.
 #[derive(Default)]
 struct Near {
     batches: BTreeMap<usize, Vec<Lender>>,
 }
 
 impl Near {
-    /// Decodes the lenders around some batches that were not there for those before, and forgets others.
+    /// Decodes the referenced bricks around some batches that were not there for those before, and forgets others.
     fn move_to(
         &mut self,
         encodings: &Encodings,
         tree: &SequenceTree,
         comparisons: &[Comparison],
-        lenders: &impl Fn(&Range<u32>) -> Vec<(u32, KeptCodec)>,
+        referenced_bricks: &impl Fn(&Range<u32>) -> Vec<(u32, KeptCodec)>,
     ) -> io::Result<()> {
         let around = comparisons[0].around.start..comparisons[comparisons.len() - 1].around.end;
         self.batches.retain(|batch, _| around.contains(batch));
         for batch in around {
             if let Entry::Vacant(place) = self.batches.entry(batch) {
-                let lenders = lenders(&encodings.batches()[batch].ids);
-                place.insert(decoded(encodings, tree, &lenders)?);
+                let referenced_bricks = referenced_bricks(&encodings.batches()[batch].ids);
+                place.insert(decoded(encodings, tree, &referenced_bricks)?);
             }
         }
         Ok(())
     }
 
-    /// The lenders of some of the batches.
-    fn lenders(&self, around: &Range<usize>) -> Vec<&Lender> {
-        self.batches.range(around.clone()).flat_map(|(_, lenders)| lenders).collect()
+    /// The referenced bricks of some of the batches.
+    fn referenced_bricks(&self, around: &Range<usize>) -> Vec<&Lender> {
+        self.batches.range(around.clone()).flat_map(|(_, referenced_bricks)| referenced_bricks).collect()
     }
 }
 
 fn decoded(
     encodings: &Encodings,
     tree: &SequenceTree,
-    lenders: &[(u32, KeptCodec)],
+    referenced_bricks: &[(u32, KeptCodec)],
 ) -> io::Result<Vec<Lender>> {
     let mut places: [Vec<u32>; KeptCodec::ALL.len()] = Default::default();
     let mut tried = Vec::new();
-    for &(id, codec) in lenders {
+    for &(id, codec) in referenced_bricks {
         places[codec as usize].push(id);
     }
     for codec in KeptCodec::ALL {
         tried.push(encodings.texels(&places[codec as usize], codec)?);
     }
-    let lender = |&(id, codec): &(u32, KeptCodec)| {
+    let referenced = |&(id, codec): &(u32, KeptCodec)| {
         let place = places[codec as usize].binary_search(&id).expect("every lender is of one of the codecs");
         let (Tried { costs, bytes, axes }, codec) = (&tried[codec as usize], codec.codec());
         let size = codec.layout().brick_bytes();
@@ -287,15 +293,15 @@ fn decoded(
         let texels = decode(codec, bytes, axis, &SequenceRange::default(), BrickRange::SEQUENCE);
         let (mean, energy) = moments(&texels);
         let extent = encodings.range(tree, id).extent.to_f64() * f64::from(encodings.sequence.span);
-        let norm = costs[place].norm;
+        let error_l2 = costs[place].error_l2;
         // The part of its energy that is its own error is stretched with it.
-        let trust = (1.0 - (norm / extent).powi(2) / energy.max(f64::MIN_POSITIVE)).max(0.0).sqrt();
+        let trust = (1.0 - (error_l2 / extent).powi(2) / energy.max(f64::MIN_POSITIVE)).max(0.0).sqrt();
         let mut shape = [0.0; COARSE];
         coarse(&texels, mean, energy, &mut shape);
         let squares = sum(|i| f64::from(texels[i]).powi(2));
         Lender { texels, mean, energy, squares, coarse: shape.map(|v| v * trust as f32) }
     };
-    Ok(lenders.par_iter().map(lender).collect())
+    Ok(referenced_bricks.par_iter().map(referenced).collect())
 }
 
 /// Sums that run side by side: the order of adding is fixed, and a compiler may use vectors.
@@ -330,22 +336,23 @@ fn coarse(values: &[f32; BRICK_VOXELS], mean: f64, energy: f64, out: &mut [f32])
     out.iter_mut().for_each(|v| *v = ((f64::from(*v) - 8.0 * mean) * scale) as f32);
 }
 
-/// For each comparison, and each of its borrowers, the closest of the lenders.
+/// For each comparison, and each of its borrowers, the closest of the referenced bricks.
 fn nearest(
     encodings: &Encodings,
     tree: &SequenceTree,
     comparisons: &[Comparison],
     near: &Near,
 ) -> io::Result<Vec<Offers>> {
-    let codebooks = comparisons.par_iter().map(|comparison| Codebook::new(near.lenders(&comparison.around)));
+    let codebooks =
+        comparisons.par_iter().map(|comparison| Codebook::new(near.referenced_bricks(&comparison.around)));
     let codebooks: Vec<Codebook> = codebooks.collect();
     let parts = comparisons.iter().zip(&codebooks).flat_map(|(comparison, codebook)| {
         comparison.borrowers.chunks(ROWS).map(move |ids| (comparison, codebook, ids))
     });
     let parts: Vec<(&Comparison, &Codebook, &[u32])> = parts.collect();
     let offers = parts.into_par_iter().map(|(comparison, codebook, ids)| {
-        let _span = trace::span("share");
-        codebook.nearest(encodings, ids, &tree.pool.read(ids)?, &comparison.lenders)
+        let _span = profile::span("share");
+        codebook.nearest(encodings, ids, &tree.pool.read(ids)?, &comparison.referenced_bricks)
     });
     let mut parts = offers.collect::<io::Result<Vec<Offers>>>()?.into_iter();
     let of = |comparison: &Comparison| {
@@ -359,22 +366,22 @@ fn nearest(
     Ok(comparisons.iter().map(of).collect())
 }
 
-/// The lenders of a comparison, and their shapes as they are first compared, a row each.
+/// The referenced bricks of a comparison, and their shapes as they are first compared, a row each.
 struct Codebook<'a> {
-    lenders: Vec<&'a Lender>,
+    referenced_bricks: Vec<&'a Lender>,
     shapes: Array2<f32>,
 }
 
 impl<'a> Codebook<'a> {
-    fn new(lenders: Vec<&'a Lender>) -> Self {
-        let mut shapes = Array2::<f32>::zeros((lenders.len(), COARSE));
-        for (lender, mut row) in lenders.iter().zip(shapes.rows_mut()) {
-            row.as_slice_mut().expect("rows are contiguous").copy_from_slice(&lender.coarse);
+    fn new(referenced_bricks: Vec<&'a Lender>) -> Self {
+        let mut shapes = Array2::<f32>::zeros((referenced_bricks.len(), COARSE));
+        for (referenced, mut row) in referenced_bricks.iter().zip(shapes.rows_mut()) {
+            row.as_slice_mut().expect("rows are contiguous").copy_from_slice(&referenced.coarse);
         }
-        Self { lenders, shapes }
+        Self { referenced_bricks, shapes }
     }
 
-    /// For each of some bricks the closest lenders; `places` are those of the lenders.
+    /// For each of some bricks the closest referenced bricks; `places` are those of the referenced bricks.
     fn nearest(
         &self,
         encodings: &Encodings,
@@ -395,15 +402,15 @@ impl<'a> Codebook<'a> {
         for (((&id, brick), mean), similar) in ids.iter().zip(bricks).zip(means).zip(similar.rows()) {
             let measure = encodings.measure(brick, &Mask512::ALL);
             let offer = |j: usize| {
-                let range = borrow(&encodings.sequence, brick, mean, self.lenders.get(j)?)?;
+                let range = borrow(&encodings.sequence, brick, mean, self.referenced_bricks.get(j)?)?;
                 let value = encodings.sequence.decoder(range);
-                let decoded = self.lenders[j].texels.map(value);
-                let Cost { norm, active_norm, .. } = measure.of(&decoded, None);
-                Some(Offer { lender: j as u32, range: range.to_word(), norm, active_norm })
+                let decoded = self.referenced_bricks[j].texels.map(value);
+                let Cost { error_l2, active_error_l2, .. } = measure.of(&decoded, None);
+                Some(Offer { referenced: j as u32, range: range.to_word(), error_l2, active_error_l2 })
             };
             let closest = closest(similar.iter().copied(), |j| places[j].0 != id);
             let mut offers: Vec<Offer> = closest.into_iter().filter_map(offer).collect();
-            offers.sort_by(|a, b| a.norm.total_cmp(&b.norm));
+            offers.sort_by(|a, b| a.error_l2.total_cmp(&b.error_l2));
             all.counts.push(offers.len() as u8);
             all.all.extend(offers);
         }
@@ -424,18 +431,18 @@ fn closest(similar: impl Iterator<Item = f32>, may_lend: impl Fn(usize) -> bool)
     closest.map(|(_, j)| j)
 }
 
-/// The range under which a lender's texels come closest to a brick of this mean, as a line through them does; `None` if
+/// The range under which a referenced brick's texels come closest to a brick of this mean, as a line through them does; `None` if
 /// it runs the other way.
-fn borrow(sequence: &SequenceRange, brick: &Brick, mean: f64, lender: &Lender) -> Option<BrickRange> {
-    let (values, texels) = (&brick.values, &lender.texels);
-    let product = sum(|i| (f64::from(values[i]) - mean) * (f64::from(texels[i]) - lender.mean));
+fn borrow(sequence: &SequenceRange, brick: &Brick, mean: f64, referenced: &Lender) -> Option<BrickRange> {
+    let (values, texels) = (&brick.values, &referenced.texels);
+    let product = sum(|i| (f64::from(values[i]) - mean) * (f64::from(texels[i]) - referenced.mean));
     let (lo, span) = (f64::from(sequence.lo), f64::from(sequence.span));
-    let gain = product / lender.energy;
-    let min = ((mean - gain * lender.mean - lo) / span * 65535.0).round().clamp(0.0, 65535.0);
+    let gain = product / referenced.energy;
+    let min = ((mean - gain * referenced.mean - lo) / span * 65535.0).round().clamp(0.0, 65535.0);
     // The minimum is coarse and may have met an end of the range: the extent makes the best of it.
     let rest = lo + span * min / 65535.0;
     let dot = sum(|i| (f64::from(values[i]) - rest) * f64::from(texels[i]));
-    let extent = f16::from_f64(dot / lender.squares / span);
+    let extent = f16::from_f64(dot / referenced.squares / span);
     let is_ahead = extent.is_finite() && extent > f16::ZERO;
     is_ahead.then_some(BrickRange { min: min as u16, extent })
 }

@@ -11,24 +11,24 @@ use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder};
 #[derive(Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
 pub(super) struct Note {
-    norm: f64,
-    active_norm: f64,
+    error_l2: f64,
+    active_error_l2: f64,
     max: f32,
     pub word: u32,
 }
 
 impl Note {
     pub fn new(cost: Cost, word: u32) -> Self {
-        Self { norm: cost.norm, active_norm: cost.active_norm, max: cost.max, word }
+        Self { error_l2: cost.error_l2, active_error_l2: cost.active_error_l2, max: cost.max, word }
     }
 
     pub fn cost(&self) -> Cost {
-        Cost { norm: self.norm, active_norm: self.active_norm, max: self.max }
+        Cost { error_l2: self.error_l2, active_error_l2: self.active_error_l2, max: self.max }
     }
 }
 
 /// One kind of result for the bricks of a pool, each once: notes and texels.
-pub(super) struct Kept {
+pub(super) struct Spilled {
     places: Places,
     notes: Scratch,
     texels: Option<Scratch>,
@@ -91,7 +91,7 @@ impl Places {
     }
 }
 
-impl Kept {
+impl Spilled {
     /// Nothing yet of a kind.
     pub fn new(scratch: &ScratchFolder, kind: Kind) -> Self {
         Self {

@@ -1,4 +1,4 @@
-//! What each thread is doing, for `build --trace`: spans that Chrome's and Perfetto's viewers draw.
+//! What each thread is doing, for `build --profile`: spans that Chrome's and Perfetto's viewers draw.
 
 use std::path::Path;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use serde_json::{Value as Json, json};
 
-use crate::aside;
+use crate::atomic_file;
 use crate::error::Result;
 
 struct Recorder {
@@ -64,5 +64,5 @@ pub fn write(path: &Path) -> Result<()> {
     let event = |done: &Done| json!({ "name": done.name, "ph": "X", "pid": 1, "tid": done.thread, "ts": done.start, "dur": done.micros });
     let spans = recorder.spans.lock().expect("nothing panics while it adds a span");
     let events: Vec<Json> = spans.iter().map(event).collect();
-    aside::write(path, json!({ "traceEvents": events }).to_string().as_bytes())
+    atomic_file::write(path, json!({ "traceEvents": events }).to_string().as_bytes())
 }
