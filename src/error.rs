@@ -1,10 +1,12 @@
-//! What can go wrong, and the exit code of each kind.
+//! What can go wrong.
 
 use std::path::{Path, PathBuf};
 
+use crate::cancel::Cancelled;
 use crate::codec::OutOfRange;
 use crate::pack::{Pack, PackError, ProvenanceError};
 use crate::vdb::VdbError;
+use crate::volume::ScratchError;
 
 /// Everything that a build, an inspection or a verification can fail with.
 #[derive(Debug, thiserror::Error)]
@@ -75,9 +77,9 @@ pub enum Error {
     /// A cache entry with a valid hash but inconsistent content.
     #[error("the cache misled the build: {0}")]
     Misled(String),
-    /// The user interrupted the build.
-    #[error("interrupted: output files were not changed; the next build continues from the cache")]
-    Interrupted,
+    /// The caller cancelled the work.
+    #[error(transparent)]
+    Cancelled(#[from] Cancelled),
     /// Budgets that were exceeded, a line each.
     #[error("over budget:{0}")]
     Budget(String),
@@ -86,10 +88,9 @@ pub enum Error {
     Verify(String),
 }
 
-impl From<Error> for std::io::Error {
-    /// For readers whose errors are the system's; [`Error::io`] takes it out again.
-    fn from(error: Error) -> Self {
-        Self::other(error)
+impl From<ScratchError> for Error {
+    fn from(ScratchError { folder, source }: ScratchError) -> Self {
+        Self::Io { path: folder, source }
     }
 }
 
@@ -97,13 +98,10 @@ impl From<Error> for std::io::Error {
 pub type Result<T, E = Error> = std::result::Result<T, E>;
 
 impl Error {
-    /// Wraps what the operating system said of `path`. An error of ours that a reader carried inside comes out again.
+    /// Wraps what the operating system said of `path`.
     pub fn io(path: impl Into<PathBuf>) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.into();
-        move |source| match source.downcast::<Self>() {
-            Ok(ours) => ours,
-            Err(source) => Self::Io { path, source },
-        }
+        move |source| Self::Io { path, source }
     }
 
     /// Wraps what is wrong with the OpenVDB file at `path`.
@@ -122,32 +120,5 @@ impl Error {
     pub fn provenance(pack: &Pack) -> impl FnOnce(ProvenanceError) -> Self {
         let path = pack.path().to_owned();
         move |source| Self::Provenance { path, source }
-    }
-
-    /// The process's exit code for this kind of failure, as `volpack help` lists them.
-    pub fn exit_code(&self) -> u8 {
-        match self {
-            Self::Io { source, .. } => match source.kind() {
-                std::io::ErrorKind::NotFound
-                | std::io::ErrorKind::PermissionDenied
-                | std::io::ErrorKind::IsADirectory
-                | std::io::ErrorKind::InvalidData => 3,
-                _ => 1,
-            },
-            Self::Other(_) => 1,
-            Self::Usage(_) => 2,
-            Self::Vdb { source, .. } if source.is_unsupported() => 6,
-            Self::Pack { source, .. } if source.is_unsupported() => 6,
-            Self::Provenance { source, .. } if source.is_unsupported() => 6,
-            Self::Vdb { .. } | Self::Pack { .. } | Self::Provenance { .. } => 3,
-            Self::Manifest { .. } | Self::Input(_) => 3,
-            Self::Changed(_) | Self::Misled(_) => 3,
-            Self::OutOfRange { .. } => 3,
-            Self::Verify(_) => 4,
-            Self::Budget(_) => 5,
-            Self::Unsupported(_) => 6,
-            // What shells say of a process that Ctrl-C ended.
-            Self::Interrupted => 130,
-        }
     }
 }

@@ -18,7 +18,7 @@
 //! - [`verify`] compares a finished pack with its source, [`report`] puts files into figures and pages.
 //! - [`render`] traces pictures of packs and sources, on the CPU and through wgpu.
 //! - [`sweep`] measures many settings side by side, and how steady each is.
-//! - [`cli`] is the command line; [`interrupt`] ends long work in good order.
+//! - [`cli`] is the command line; [`progress`] and [`cancel`] are how long work and its caller speak.
 //!
 //! To build a pack:
 //!
@@ -35,14 +35,17 @@
 
 mod atomic_file;
 pub mod cache;
+pub mod cancel;
 pub mod cli;
 pub mod codec;
 pub mod error;
-pub mod interrupt;
+pub mod file_stamp;
 pub mod manifest;
 pub mod pack;
 pub mod pipeline;
+mod pods;
 pub mod profile;
+pub mod progress;
 pub mod render;
 pub mod report;
 pub mod sequence;

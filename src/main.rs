@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use clap::Parser;
-use volpack::cli::{Cli, print_error, run};
+use volpack::cli::{Cli, exit_code, print_error, run};
 
 fn main() -> ExitCode {
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
@@ -17,7 +17,7 @@ fn main() -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             print_error(&error);
-            ExitCode::from(error.exit_code())
+            ExitCode::from(exit_code::of(&error))
         }
     }
 }

@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 
 use common::{animation, fixture};
 use reseal::reseal;
+use volpack::cli::exit_code;
 use volpack::error::Error;
 use volpack::pack::{Pack, Region};
 use volpack::pipeline::{Job, Outcome, Silent, VerifyLevel, build};
@@ -93,7 +94,7 @@ impl Case {
         let outcome = build(&job, &mut Silent).unwrap_or_else(|e| panic!("{what}: {e}"));
         let bytes = std::fs::read(&job.output).unwrap();
         let pack = Pack::from_bytes(bytes.clone()).unwrap();
-        let report = voxels(&pack, &Sources::find(&pack, &self.frames).unwrap(), 2, |_| {}).unwrap();
+        let report = voxels(&pack, &Sources::find(&pack, &self.frames).unwrap(), 2, &mut Silent).unwrap();
         assert!(report.failures.iter().all(|why| is_ruined(why)), "{what}: {:?}", report.failures);
         let (gpu_bytes, bits) = (outcome.summary.gpu_bytes, outcome.summary.bits_per_voxel);
         Built { what, bytes, pack, report, gpu_bytes, bits }
@@ -136,7 +137,7 @@ fn max_error(bound: &str) -> Quality {
 
 /// How many bytes an error says are the least.
 fn least(error: &Error) -> u64 {
-    assert_eq!(error.exit_code(), 2, "{error}");
+    assert_eq!(exit_code::of(&error), 2, "{error}");
     let text = error.to_string();
     let number =
         text.split_once("the least is ").and_then(|(_, rest)| rest.split(':').next()).unwrap_or_default();
@@ -298,10 +299,9 @@ fn sizes_and_bits_are_never_passed_and_the_least_is_named() {
             assert!(got <= bits, "{}: {got} of {bits} bits per voxel", case.name);
         }
         assert_eq!(
-            case.attempt(case.settings(Quality::BitsPerVoxel(0.001)), folder.path())
-                .err()
-                .unwrap()
-                .exit_code(),
+            exit_code::of(
+                &case.attempt(case.settings(Quality::BitsPerVoxel(0.001)), folder.path()).err().unwrap()
+            ),
             2
         );
     }
@@ -396,7 +396,7 @@ fn adverse_bricks_are_packed_in_every_way() {
                 let too_large = settings.format == Format::F16 && grid.name == "huge_range";
                 match built {
                     Err(error) if too_large => {
-                        assert_eq!(error.exit_code(), 3, "{what}: {error}");
+                        assert_eq!(exit_code::of(&error), 3, "{what}: {error}");
                         assert!(error.to_string().contains("65504"), "{what}: {error}");
                     }
                     Err(error) => failed.push(format!("{what}: {error}")),
@@ -446,7 +446,7 @@ fn values_too_far_apart_are_refused() {
                 continue;
             }
             let error = case.attempt(settings, folder.path()).err().unwrap();
-            assert_eq!(error.exit_code(), 3, "{format:?}: {error}");
+            assert_eq!(exit_code::of(&error), 3, "{format:?}: {error}");
             let why = if refused { "span" } else { "65504" };
             assert!(error.to_string().contains("density") && error.to_string().contains(why), "{error}");
         }
@@ -491,7 +491,7 @@ fn clusters_are_refused_with_the_adaptive_format() {
     let case = Case::fog();
     let settings = Settings { clustering: Some(Clustering::default()), ..case.settings(Quality::default()) };
     let error = case.attempt(settings, folder.path()).err().unwrap();
-    assert_eq!(error.exit_code(), 2, "{error}");
+    assert_eq!(exit_code::of(&error), 2, "{error}");
     assert!(error.to_string().contains("adaptive"), "{error}");
 }
 
@@ -506,7 +506,7 @@ fn forged(case: &Case, built: &Built, from: &str, to: &str) -> Vec<String> {
     reseal(&mut bytes);
     let pack = Pack::from_bytes(bytes).unwrap();
     pack.check_chunks().unwrap();
-    voxels(&pack, &Sources::find(&pack, &case.frames).unwrap(), 2, |_| {}).unwrap().failures
+    voxels(&pack, &Sources::find(&pack, &case.frames).unwrap(), 2, &mut Silent).unwrap().failures
 }
 
 #[test]

@@ -34,8 +34,12 @@ fn the_same_frames_give_the_kept_bytes() {
 
     let pack = Pack::from_bytes(kept).unwrap();
     pack.check_chunks().unwrap();
-    let report =
-        volpack::verify::voxels(&pack, &volpack::verify::Sources::find(&pack, &frames).unwrap(), 1, |_| {})
-            .unwrap();
+    let report = volpack::verify::voxels(
+        &pack,
+        &volpack::verify::Sources::find(&pack, &frames).unwrap(),
+        1,
+        &mut volpack::progress::Silent,
+    )
+    .unwrap();
     assert!(report.ok, "{:?}", report.failures);
 }

@@ -55,7 +55,7 @@ impl Victim {
         };
         pack.check_chunks().expect("the digests are right");
         let sources = Sources::find(&pack, &self.sources).unwrap();
-        let report = voxels(&pack, &sources, 1, |_| {}).unwrap();
+        let report = voxels(&pack, &sources, 1, &mut volpack::progress::Silent).unwrap();
         report.failures.first().cloned()
     }
 

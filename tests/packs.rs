@@ -9,6 +9,7 @@ use std::path::Path;
 
 use common::{animation, build_verified, facts, fixture, fixtures, probes};
 use vdb_writer::{GridFile, write_grid};
+use volpack::cli::exit_code;
 use volpack::codec::Codec;
 use volpack::pack::{Pack, Region};
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
@@ -72,7 +73,7 @@ fn integers_of_any_size_are_kept_by_halves_or_refused() {
         let job =
             Job::new(vec![path.clone()], folder.path().join("x.volpack"), keep.clone(), VerifyLevel::Voxels);
         let error = build(&job, &mut Silent).err().expect("no float holds them");
-        assert_eq!(error.exit_code(), 3);
+        assert_eq!(exit_code::of(&error), 3);
         assert!(error.to_string().contains("integers = \"split\""), "{error}");
 
         for format in [Format::F32, Format::Adaptive] {
@@ -150,7 +151,7 @@ fn unverified(path: &Path, settings: Settings, folder: &Path) -> (Pack, VerifyRe
     let job = Job::new(frames.clone(), folder.join("unverified.volpack"), settings, VerifyLevel::None);
     build(&job, &mut Silent).unwrap();
     let pack = Pack::open(&job.output).unwrap();
-    let report = voxels(&pack, &Sources::find(&pack, &frames).unwrap(), 1, |_| {}).unwrap();
+    let report = voxels(&pack, &Sources::find(&pack, &frames).unwrap(), 1, &mut Silent).unwrap();
     (pack, report)
 }
 

@@ -30,8 +30,6 @@ use schemars::JsonSchema;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-pub use artefact::pods;
-pub use file_stamps::Stamp;
 pub use key::{Key, Stage};
 pub use maintain::{Damage, Stats};
 

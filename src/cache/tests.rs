@@ -1,3 +1,4 @@
+use crate::file_stamp::Stamp;
 use std::fs;
 use std::path::PathBuf;
 use std::time::{Duration, SystemTime};

@@ -50,7 +50,7 @@ pub fn run(args: &BuildArgs, common: Common) -> Result<()> {
     let mut built: Vec<(String, Figures)> = Vec::new();
     let mut breaches: Vec<Breach> = Vec::new();
     for (name, job) in args.jobs.jobs(cache.as_ref(), VerifyLevel::All)? {
-        if matches!(failure, Some(Error::Interrupted)) {
+        if matches!(failure, Some(Error::Cancelled(_))) {
             break;
         }
         let mut asset = json!({ "asset": name });
@@ -71,7 +71,7 @@ pub fn run(args: &BuildArgs, common: Common) -> Result<()> {
         }
         assets.push(asset);
     }
-    if let Some(cache) = cache.filter(|_| !matches!(failure, Some(Error::Interrupted))) {
+    if let Some(cache) = cache.filter(|_| !matches!(failure, Some(Error::Cancelled(_)))) {
         super::cache::finish(&cache, common.quiet || args.json)?;
     }
     args.profile.as_deref().map_or(Ok(()), profile::write)?;

@@ -9,12 +9,11 @@ use serde_json::json;
 
 use super::progress::Reporter;
 use super::style::{GOOD, TITLE, WARNING};
-use super::{Common, outln, print_json};
+use super::{Common, interrupt, outln, print_json};
 use crate::cache::Cache;
 use crate::cache::remote::{Policy, Remote};
 use crate::error::{Error, Result};
-use crate::interrupt;
-use crate::pipeline::Progress;
+use crate::progress::Progress;
 use crate::settings::ByteSize;
 use crate::units::{bytes, count};
 
@@ -123,11 +122,11 @@ pub fn finish(cache: &Cache, quiet: bool) -> Result<()> {
         let now = all.saturating_sub(left);
         reporter.advance(now.saturating_sub(sent));
         sent = now.max(sent);
-        !interrupt::is_requested()
+        !interrupt::TOKEN.is_cancelled()
     });
     warnings.iter().for_each(|warning| reporter.warn(warning));
     reporter.finish();
-    interrupt::check()
+    Ok(interrupt::TOKEN.check()?)
 }
 
 #[derive(Args)]

@@ -8,7 +8,7 @@ use clap::Args;
 use rayon::prelude::*;
 
 use super::style::{TITLE, WARNING};
-use super::{Common, outln};
+use super::{Common, exit_code, outln};
 use crate::error::{Error, Result};
 use crate::manifest::DEFAULT_NAME;
 use crate::sequence::{Numbering, Sequence, number, sequences};
@@ -81,7 +81,7 @@ pub fn run(args: &InitArgs, common: Common) -> Result<()> {
     if refusals.len() == names.len() {
         let nothing =
             Error::Unsupported(format!("{}: no .vdb file in it can be packed", args.folder.display()));
-        let all_are_unsupported = refusals.iter().all(|e| e.exit_code() == nothing.exit_code());
+        let all_are_unsupported = refusals.iter().all(|e| exit_code::of(e) == exit_code::of(&nothing));
         return Err(if all_are_unsupported { nothing } else { Error::Input(nothing.to_string()) });
     }
     // Another manifest is someone's work.

@@ -2,9 +2,11 @@
 
 mod build;
 mod cache;
+pub mod exit_code;
 mod explain;
 mod init;
 mod inspect;
+mod interrupt;
 mod jobs;
 mod progress;
 mod render;
@@ -213,7 +215,7 @@ impl PictureArgs {
 /// Runs the command that the arguments ask for.
 ///
 /// # Errors
-/// What the command failed with; its [`Error::exit_code`] is the process's.
+/// What the command failed with; [`exit_code::of`] says what the process ends with.
 pub fn run(cli: Cli) -> Result<()> {
     if let Some(threads) = cli.common.threads {
         rayon::ThreadPoolBuilder::new()
@@ -223,7 +225,7 @@ pub fn run(cli: Cli) -> Result<()> {
     }
     if matches!(cli.command, Command::Build(_) | Command::Watch(_) | Command::Verify(_) | Command::Report(_))
     {
-        crate::interrupt::catch();
+        interrupt::catch();
     }
     match cli.command {
         Command::Build(args) => build::run(&args, cli.common),

@@ -5,8 +5,10 @@ use std::time::Duration;
 
 use indicatif::{ProgressBar, ProgressStyle};
 
+use super::interrupt;
 use super::style::WARNING;
-use crate::pipeline::Progress;
+use crate::cancel::CancelToken;
+use crate::progress::Progress;
 
 /// Shows how one asset's build is getting on, on standard error.
 pub struct Reporter {
@@ -57,6 +59,10 @@ impl Progress for Reporter {
         if let Some(bar) = &self.bar {
             bar.inc(steps);
         }
+    }
+
+    fn cancel_token(&self) -> CancelToken {
+        interrupt::TOKEN.clone()
     }
 
     fn warn(&mut self, warning: &str) {

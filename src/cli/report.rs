@@ -141,7 +141,7 @@ impl Gathering<'_> {
     fn add(&mut self, name: &str, make: impl FnOnce(&mut Self) -> Result<AssetReport>) -> Result<()> {
         let asset = match make(self) {
             Ok(asset) => asset,
-            Err(Error::Interrupted) => return Err(Error::Interrupted),
+            Err(Error::Cancelled(e)) => return Err(e.into()),
             Err(error) => {
                 let message = error.to_string();
                 self.fail(error);
@@ -178,7 +178,7 @@ impl Gathering<'_> {
             reporter = Reporter::new(&format!("{name}, cheaper"), self.common.quiet);
             match cheaper(job, &pack, &figures, &mut reporter) {
                 Ok(cheaper) => Ok((outcome, pack, provenance, cheaper, None)),
-                Err(Error::Interrupted) => Err(Error::Interrupted),
+                Err(Error::Cancelled(e)) => Err(e.into()),
                 // A size that cannot be reached is no offer.
                 Err(Error::Usage(_)) => Ok((outcome, pack, provenance, None, None)),
                 Err(error) => {
@@ -255,7 +255,9 @@ impl Gathering<'_> {
         let name = reported.name.to_owned();
         let (pack, found) = (reported.pack, reported.found.as_ref());
         if self.args.html.is_some() {
-            let drawn = gallery(pack, reported.digest.as_bytes(), files, found, self.cache.as_deref())?;
+            let cache = self.cache.as_deref();
+            let drawn =
+                gallery(pack, reported.digest.as_bytes(), files, found, cache, &super::interrupt::TOKEN)?;
             self.galleries.push(Some(drawn));
         }
         if self.baseline.is_some_and(|baseline| baseline.figures(&name).is_none()) {

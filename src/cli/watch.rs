@@ -8,10 +8,9 @@ use clap::Args;
 
 use super::jobs::JobArgs;
 use super::style::{ERROR, GOOD, TITLE, WARNING};
-use super::{Common, outln};
-use crate::cache::Stamp;
+use super::{Common, interrupt, outln};
 use crate::error::{Error, Result};
-use crate::interrupt;
+use crate::file_stamp::Stamp;
 use crate::pipeline::{Job, Made, Outcome, Progress, VerifyLevel, build};
 use crate::settings::Settings;
 use crate::units::{bytes, count, psnr, seconds};
@@ -63,7 +62,7 @@ pub fn run(args: &WatchArgs, common: Common) -> Result<()> {
     let mut trouble = None;
     // A manifest that is wrong to begin with is an error, one that is being edited is waited for.
     args.jobs.jobs(cache.as_ref(), VerifyLevel::Voxels)?;
-    while !interrupt::is_requested() {
+    while !interrupt::TOKEN.is_cancelled() {
         match args.jobs.jobs(cache.as_ref(), VerifyLevel::Voxels) {
             Ok(jobs) => {
                 trouble = None;
@@ -132,7 +131,7 @@ fn build_one(name: &str, job: &Job, common: Common) -> bool {
     let outcome = build(job, &mut progress);
     let warnings = progress.0.iter().map(|w| format!("; {WARNING}{w}{WARNING:#}")).collect::<String>();
     match outcome {
-        Err(Error::Interrupted) => {}
+        Err(Error::Cancelled(_)) => {}
         Err(Error::Vdb { path, .. } | Error::Changed(path)) if is_being_written(&path) => return false,
         Err(error) => {
             outln!("{TITLE}{name}{TITLE:#}: {ERROR}kept the last good pack{ERROR:#}: {error}");

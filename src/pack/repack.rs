@@ -1,6 +1,5 @@
 //! The same pack at another level of zstd.
 
-use std::io;
 use std::path::Path;
 
 use rayon::prelude::*;
@@ -8,21 +7,40 @@ use rayon::prelude::*;
 use super::layout::{CHUNK_BYTES, encoding, kind};
 use super::tables::chunk_range;
 use super::{FinishedPack, Pack, PackError, PackWriter, Provenance, SectionSpec, compress_chunk};
+use crate::cancel::{CancelToken, Cancelled};
 
 /// Chunks that are in memory at a time: enough for every core, a few megabytes.
 const CHUNKS_IN_FLIGHT: usize = 64;
+
+/// The pack could not be written anew.
+#[derive(Debug, thiserror::Error)]
+pub enum RepackError {
+    /// The pack is damaged, or the file cannot be written.
+    #[error(transparent)]
+    Pack(#[from] PackError),
+    /// The caller cancelled it.
+    #[error(transparent)]
+    Cancelled(#[from] Cancelled),
+}
+
+impl From<std::io::Error> for RepackError {
+    fn from(error: std::io::Error) -> Self {
+        Self::Pack(error.into())
+    }
+}
 
 /// Writes `pack` beside `path` with another level (none for raw) and another provenance: byte for byte what packing
 /// its source with them would give.
 ///
 /// # Errors
-/// When the pack is damaged, or the file cannot be written.
+/// [`RepackError`].
 pub fn repack(
     pack: &Pack,
     path: &Path,
     provenance: &Provenance,
     zstd_level: Option<i32>,
-) -> Result<FinishedPack, PackError> {
+    cancel: &CancelToken,
+) -> Result<FinishedPack, RepackError> {
     let provenance = provenance.to_json()?;
     let spec = |section: &super::layout::Section| SectionSpec {
         kind: section.kind,
@@ -48,7 +66,7 @@ pub fn repack(
         writer.begin()?;
         let chunks: Vec<usize> = chunk_range(section).collect();
         for chunks in chunks.chunks(CHUNKS_IN_FLIGHT) {
-            crate::interrupt::check().map_err(io::Error::from)?;
+            cancel.check()?;
             let packed: Vec<_> = chunks
                 .par_iter()
                 .map(|&chunk| {

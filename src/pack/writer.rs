@@ -162,11 +162,11 @@ impl PackWriter {
     ///
     /// # Errors
     /// When the file cannot be written, or `write` fails.
-    pub fn words(
+    pub fn words<E: From<io::Error>>(
         &mut self,
         level: i32,
-        write: impl FnOnce(&mut dyn FnMut(&[u32]) -> io::Result<()>) -> io::Result<()>,
-    ) -> io::Result<()> {
+        write: impl FnOnce(&mut dyn FnMut(&[u32]) -> io::Result<()>) -> Result<(), E>,
+    ) -> Result<(), E> {
         self.begin()?;
         let chunk_bytes = self.specs[self.sections.len() - 1].chunk_bytes as usize;
         let mut chunks: Vec<Vec<u8>> = Vec::new();
@@ -188,7 +188,7 @@ impl PackWriter {
             }
             Ok(())
         })?;
-        self.compressed(chunks, level)
+        Ok(self.compressed(chunks, level)?)
     }
 
     /// Writes the next chunks, which are encoded side by side.

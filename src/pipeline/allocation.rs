@@ -1,100 +1,117 @@
 //! Stage 5 over the grids of a pack.
 
 use super::Progress;
+use super::cached_bricks::CachedOffers;
+use crate::cancel::CancelToken;
 use crate::error::{Error, Result};
 use crate::settings::{Format, Integers, Quality, Settings, whole_range};
-use crate::stages::allocate::{self, AdaptiveGrid, AllocateError, Target};
-use crate::stages::encodings::{ConstantAim, Encodings, GridCache, Terms};
-use crate::stages::serialise::{GridInput, SerialiseError, gpu_bytes, tree_bytes};
-use crate::vdb::{GridClass, voxel_size};
+use crate::stages::allocate::{self, AdaptiveGrid, Allocation, EarlierOffers, Target};
+use crate::stages::dedup::SequenceTree;
+use crate::stages::encoder_cache::{ConstantAim, EncoderCache, Terms};
+use crate::stages::select::GridFacts;
+use crate::stages::serialise::tree_bytes;
+use crate::vdb::GridClass;
 use crate::verify;
 use crate::volume::ValueRange;
 
-/// Decides how the bricks of every grid are coded.
-pub(super) fn allocate(
-    grids: &mut [GridInput],
+/// What makes the texels of every grid. Nothing is made yet.
+///
+/// # Errors
+/// A grid whose values no float or no range holds.
+pub(super) fn encoders(
+    facts: &[GridFacts],
+    trees: &[SequenceTree],
     settings: &Settings,
-    caches: Vec<Option<GridCache>>,
-    progress: &mut dyn Progress,
-) -> Result<()> {
-    let mut encodings = Vec::new();
-    for (grid, cache) in grids.iter().zip(caches) {
-        check_integers(grid, settings)?;
-        encodings.push(Encodings::new(&grid.tree, terms(grid, settings), cache).ok_or_else(|| {
+    cancel: &CancelToken,
+) -> Result<Vec<EncoderCache>> {
+    let one = |(facts, tree): (&GridFacts, &SequenceTree)| {
+        check_integers(facts, tree, settings)?;
+        EncoderCache::new(tree, terms(facts, tree, settings), cancel.clone()).ok_or_else(|| {
             Error::Input(format!(
                 "grid {:?}: its values span more than an f32 can hold: scale the grid down before the export",
-                grid.name
+                facts.name
             ))
-        })?);
-    }
-    match settings.format.codec() {
-        Some(codec) => {
-            for (grid, encodings) in grids.iter_mut().zip(encodings) {
-                grid.allocation = Some(match &settings.clustering {
-                    None => allocate::uniform(&grid.tree, encodings, codec),
-                    Some(clustering) => {
-                        progress.stage("cluster", grid.tree.pool.len().into(), "bricks");
-                        allocate::clustered(&mut grid.tree, encodings, codec, settings.range, clustering)
-                            .map_err(|e| allocate_error(e, grid))?
-                    }
-                });
+        })
+    };
+    facts.iter().zip(trees).map(one).collect()
+}
+
+/// Decides how the bricks of every grid are coded.
+pub(super) fn allocate(
+    facts: &[GridFacts],
+    trees: &mut [SequenceTree],
+    encoders: &mut [EncoderCache],
+    offers: &[Option<CachedOffers>],
+    settings: &Settings,
+    progress: &mut dyn Progress,
+) -> Result<Vec<Allocation>> {
+    let Some(codec) = settings.format.codec() else {
+        return adaptive(facts, trees, encoders, offers, settings, progress);
+    };
+    let mut allocations = Vec::new();
+    for ((facts, tree), encoders) in facts.iter().zip(trees).zip(encoders) {
+        allocations.push(match &settings.clustering {
+            None => allocate::uniform(tree, encoders, codec),
+            Some(clustering) => {
+                progress.stage("cluster", tree.pool.len().into(), "bricks");
+                allocate::clustered(&facts.name, tree, encoders, codec, settings.range, clustering)?
             }
-            Ok(())
-        }
-        None => adaptive(grids, encodings, settings, progress),
+        });
     }
+    Ok(allocations)
 }
 
 fn adaptive(
-    grids: &mut [GridInput],
-    encodings: Vec<Encodings>,
+    facts: &[GridFacts],
+    trees: &mut [SequenceTree],
+    encoders: &mut [EncoderCache],
+    offers: &[Option<CachedOffers>],
     settings: &Settings,
     progress: &mut dyn Progress,
-) -> Result<()> {
+) -> Result<Vec<Allocation>> {
     let size = match settings.quality {
         Quality::Size(bytes) => Some(bytes),
-        Quality::BitsPerVoxel(bits) => Some((bits * 64.0 * leaves(grids) as f64) as u64),
+        Quality::BitsPerVoxel(bits) => Some((bits * 64.0 * leaves(trees) as f64) as u64),
         _ => None,
     };
     let target = Target {
         size,
         min_frame_psnr: settings.min_frame_psnr,
-        fixed_bytes: if size.is_some() { bytes(grids, tree_bytes)? } else { 0 },
+        fixed_bytes: if size.is_some() { tree_bytes(facts.iter().zip(&*trees))? } else { 0 },
     };
-    let bricks: u64 = grids.iter().map(|g| u64::from(g.tree.pool.len())).sum();
+    let bricks: u64 = trees.iter().map(|tree| u64::from(tree.pool.len())).sum();
     progress.stage("allocate", bricks, "bricks");
-    let mut candidates = Vec::new();
-    for (grid, encodings) in grids.iter_mut().zip(encodings) {
-        let (quality, voxel_size) = (quality(grid, settings), smallest_voxel(grid));
-        let peak = peak(grid);
+    let mut grids = Vec::new();
+    for (((facts, tree), encoders), offers) in facts.iter().zip(trees).zip(encoders).zip(offers) {
+        let (quality, voxel_size, peak) =
+            (quality(facts, tree, settings), facts.smallest_voxel(), peak(tree));
         if let Quality::MaxError(bound) = quality
             && bound.absolute(peak, voxel_size) >= peak
         {
             return Err(Error::Usage(format!(
                 "grid {:?}: {}",
-                grid.name,
+                facts.name,
                 whole_range(bound, peak, voxel_size)
             )));
         }
-        candidates.push(AdaptiveGrid { voxel_size, quality, peak, tree: &mut grid.tree, encodings });
+        let earlier = offers.as_ref().map(|offers| offers as &dyn EarlierOffers);
+        grids.push(AdaptiveGrid { tree, encoders, earlier, quality, peak, voxel_size });
     }
-    let allocations = allocate::adaptive(candidates, &target, &mut |bricks| progress.advance(bricks));
-    let allocations = allocations.map_err(|e| allocate_error(e, &grids[0]))?;
-    grids.iter_mut().zip(allocations).for_each(|(grid, allocation)| grid.allocation = Some(allocation));
-    check_size(grids, settings.quality)
+    let cancel = progress.cancel_token();
+    allocate::adaptive(grids, &target, &cancel, &mut |bricks| progress.advance(bricks))
 }
 
 /// A level set whose distances keep a bound keeps its signs where the surface is further than this part of it: its surface
 /// is what was asked for, and a wide band has edges along which thousands of voxels are next to 0.
 const SIGNED_PART_OF_BOUND: f64 = 0.2;
 
-fn terms(grid: &GridInput, settings: &Settings) -> Terms {
+fn terms(facts: &GridFacts, tree: &SequenceTree, settings: &Settings) -> Terms {
     let is_adaptive = settings.format == Format::Adaptive;
-    let (quality, voxel_size) = (quality(grid, settings), smallest_voxel(grid));
+    let (quality, voxel_size) = (quality(facts, tree, settings), facts.smallest_voxel());
     let sign_matters = verify::SIGN_MATTERS_VOXELS * voxel_size;
     let (aim, sign_matters) = match quality {
         Quality::MaxError(bound) => {
-            let bound = bound.absolute(peak(grid), voxel_size);
+            let bound = bound.absolute(peak(tree), voxel_size);
             (ConstantAim::Max, sign_matters.min(SIGNED_PART_OF_BOUND * bound))
         }
         _ => (ConstantAim::Squares, sign_matters),
@@ -103,59 +120,56 @@ fn terms(grid: &GridInput, settings: &Settings) -> Terms {
         range: settings.range,
         aim,
         // One codec for all bricks is kept whatever it does to signs and integers: verification says so.
-        sign_matters: (grid.class == GridClass::LevelSet && is_adaptive).then_some(sign_matters),
-        error_below: (grid.is_integer && settings.integers != Integers::Nearest && is_adaptive)
+        sign_matters: (facts.class == GridClass::LevelSet && is_adaptive).then_some(sign_matters),
+        error_below: (facts.is_integer && settings.integers != Integers::Nearest && is_adaptive)
             .then_some(verify::KEPT_INTEGER_ERROR),
     }
 }
 
 /// Integers that no float holds are not kept by any codec.
-fn check_integers(grid: &GridInput, settings: &Settings) -> Result<()> {
-    let frames = grid.frames.iter().zip(&grid.tree.frames);
+fn check_integers(facts: &GridFacts, tree: &SequenceTree, settings: &Settings) -> Result<()> {
+    let frames = facts.frames.iter().zip(&tree.frames);
     match frames.into_iter().find(|(_, frame)| frame.stats.rounding > 0.0) {
-        Some((frame, _)) if grid.is_integer && settings.integers == Integers::Keep => {
+        Some((frame, _)) if facts.is_integer && settings.integers == Integers::Keep => {
             Err(Error::Input(format!(
                 "grid {:?} frame {}: it has integers past 16,777,216 that no 32-bit float holds: set integers = \"split\" \
              (--integers split) to pack it as grids of 24 bits that give every integer back exactly, or \"nearest\" to \
              take the nearest floats",
-                grid.name, frame.number
+                facts.name, frame.number
             )))
         }
         _ => Ok(()),
     }
 }
 
-fn peak(grid: &GridInput) -> f64 {
-    ValueRange::peak(grid.tree.active_range(), grid.tree.background)
+fn peak(tree: &SequenceTree) -> f64 {
+    ValueRange::peak(tree.active_range(), tree.background)
 }
 
 /// What is asked of a grid.
-fn quality(grid: &GridInput, settings: &Settings) -> Quality {
-    settings.quality.of_grid(grid.class, peak(grid), smallest_voxel(grid))
-}
-
-fn smallest_voxel(grid: &GridInput) -> f64 {
-    grid.frames.iter().map(|f| voxel_size(&f.transform)).fold(f64::INFINITY, f64::min)
-}
-
-fn bytes(grids: &[GridInput], of: fn(&[GridInput]) -> Result<u64, SerialiseError>) -> Result<u64> {
-    of(grids).map_err(|e| Error::Unsupported(e.to_string()))
+fn quality(facts: &GridFacts, tree: &SequenceTree, settings: &Settings) -> Quality {
+    settings.quality.of_grid(facts.class, peak(tree), facts.smallest_voxel())
 }
 
 /// Leaves of the source over all frames.
-fn leaves(grids: &[GridInput]) -> u64 {
-    grids.iter().flat_map(|g| &g.tree.frames).map(|f| f.stats.leaves).sum()
+fn leaves(trees: &[SequenceTree]) -> u64 {
+    trees.iter().flat_map(|tree| &tree.frames).map(|frame| frame.stats.leaves).sum()
 }
 
 /// A size that the coarsest choice does not meet is an error that names the least.
-fn check_size(grids: &[GridInput], quality: Quality) -> Result<()> {
-    let leaves = leaves(grids);
-    let bits_of = |bytes: u64| if leaves == 0 { 0.0 } else { bytes as f64 / (64.0 * leaves as f64) };
-    if !quality.is_size() {
+pub(super) fn check_size(
+    facts: &[GridFacts],
+    trees: &[SequenceTree],
+    texel_bytes: u64,
+    settings: &Settings,
+) -> Result<()> {
+    if settings.format != Format::Adaptive || !settings.quality.is_size() {
         return Ok(());
     }
-    let bytes = bytes(grids, gpu_bytes)?;
-    match quality {
+    let leaves = leaves(trees);
+    let bits_of = |bytes: u64| if leaves == 0 { 0.0 } else { bytes as f64 / (64.0 * leaves as f64) };
+    let bytes = tree_bytes(facts.iter().zip(trees))? + texel_bytes;
+    match settings.quality {
         Quality::Size(asked) if bytes > asked => Err(Error::Usage(format!(
             "size: {asked} bytes on the GPU cannot be reached, the least is {bytes}: raise it, or pack fewer frames"
         ))),
@@ -164,12 +178,5 @@ fn check_size(grids: &[GridInput], quality: Quality) -> Result<()> {
             bits_of(bytes)
         ))),
         _ => Ok(()),
-    }
-}
-
-fn allocate_error(error: AllocateError, grid: &GridInput) -> Error {
-    match error {
-        AllocateError::Io(source) => Error::io(grid.tree.scratch.path())(source),
-        AllocateError::OutOfRange(source) => Error::OutOfRange { grid: grid.name.clone(), source },
     }
 }

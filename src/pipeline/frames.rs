@@ -4,17 +4,16 @@ use std::sync::Arc;
 
 use rayon::prelude::*;
 
+use super::cached_bricks::GridCache;
 use super::{Job, Plan, Progress, memory};
 use crate::cache::{Cache, Key, Stage};
 use crate::error::{Error, Result};
 use crate::profile;
 use crate::settings::{Format, Masks, Settings};
 use crate::stages::dedup::{DedupError, Fetch, FrameIndex, MaskPolicy, SequenceTree};
-use crate::stages::encodings::GridCache;
 use crate::stages::flatten::{Flattened, flatten};
 use crate::stages::metadata::{FrameSource, SequenceInfo};
 use crate::stages::select::{SelectedGrid, Selection, find};
-use crate::stages::serialise::{FrameInput, GridInput};
 use crate::vdb::{GridClass, VdbFile};
 use crate::volume::{Blocks, Brick, FlatFrame};
 
@@ -34,20 +33,17 @@ pub(super) fn read(
     cache: Option<&Arc<Cache>>,
     alter: Option<Alter>,
     progress: &mut dyn Progress,
-) -> Result<Vec<GridInput>> {
+) -> Result<Vec<SequenceTree>> {
     let (Plan { sequence, selection, .. }, settings) = (plan, &job.settings);
     let at_once = memory::frames_at_once(plan, &job.resources)?;
     let window_frames = (at_once / 2).max(1);
-    let mut grids: Vec<GridInput> = Vec::new();
-    for grid in &selection.grids {
+    let cancel = progress.cancel_token();
+    let tree = |grid: &SelectedGrid| {
         let fetch = cache.is_some().then(|| fetch(sequence, grid, settings, window_frames));
-        grids.push(grid_input(
-            sequence,
-            grid,
-            SequenceTree::new(job.resources.scratch.clone(), fetch),
-            settings,
-        ));
-    }
+        SequenceTree::new(job.resources.scratch.clone(), fetch)
+    };
+    let mut trees: Vec<SequenceTree> = selection.grids.iter().map(tree).collect();
+    let mut add = |sources: &[FrameSource], frames| add(&mut trees, selection, sources, frames);
     let read = |window: &[FrameSource]| -> Vec<Result<Vec<Option<Frame>>>> {
         let read = |frame: &FrameSource| read_frame(frame, selection, settings, cache.map(|c| &**c), alter);
         window.par_iter().map(read).collect()
@@ -56,7 +52,7 @@ pub(super) fn read(
     let mut window = windows.next().unwrap_or_default();
     let mut frames = read(window);
     while !window.is_empty() {
-        crate::interrupt::check()?;
+        cancel.check()?;
         let next = windows.next().unwrap_or_default();
         // The next frames are read while these are added: on this thread, so that what stays does not lie between what
         // comes and goes with a frame, which would keep the allocator from using it anew.
@@ -64,33 +60,32 @@ pub(super) fn read(
         if at_once > 1 {
             rayon::in_place_scope(|scope| {
                 scope.spawn(|_| later = read(next));
-                add(&mut grids, window, frames)
+                add(window, frames)
             })?;
         } else {
-            add(&mut grids, window, frames)?;
+            add(window, frames)?;
             later = read(next);
         }
         progress.advance(window.len() as u64);
         (window, frames) = (next, later);
     }
-    for grid in &mut grids {
-        grid.tree.seal().map_err(Error::io(grid.tree.scratch.path()))?;
-    }
-    Ok(grids)
+    trees.iter_mut().try_for_each(SequenceTree::seal)?;
+    Ok(trees)
 }
 
 /// Adds frames to their grids, in order.
 fn add(
-    grids: &mut [GridInput],
+    trees: &mut [SequenceTree],
+    selection: &Selection,
     sources: &[FrameSource],
     frames: Vec<Result<Vec<Option<Frame>>>>,
 ) -> Result<()> {
     let _span = profile::span("dedup");
     for (source, frame) in sources.iter().zip(frames) {
-        for (grid, frame) in grids.iter_mut().zip(frame?) {
+        for ((tree, grid), frame) in trees.iter_mut().zip(&selection.grids).zip(frame?) {
             let Some((frame_index, voxels)) = frame else { continue };
-            grid.tree.add(frame_index, voxels).map_err(|e| match e {
-                DedupError::Scratch { source } => Error::io(grid.tree.scratch.path())(source),
+            tree.add(frame_index, voxels).map_err(|e| match e {
+                DedupError::Scratch(e) => e.into(),
                 DedupError::Background { .. } => Error::Input(format!(
                     "{}: grid {:?}: {e}: export the whole sequence with one background",
                     source.path.display(),
@@ -160,7 +155,7 @@ fn fetch(sequence: &SequenceInfo, grid: &SelectedGrid, settings: &Settings, at_o
     let frames: Vec<FrameSource> = grid.frames.iter().map(|&i| sequence.frames[i].clone()).collect();
     let (grid, settings) = (grid.clone(), settings.clone());
     let read = move |place: usize| {
-        let frame = &frames[place];
+        let frame: &FrameSource = &frames[place];
         let file = VdbFile::open(&frame.path).map_err(Error::vdb(&frame.path))?;
         let flat = flatten_grid(&file, frame, &grid, &settings)?;
         frame.check_unchanged()?;
@@ -212,28 +207,5 @@ fn mask_policy(settings: &Settings, class: GridClass) -> MaskPolicy {
         }
         (Masks::Auto, ..) => MaskPolicy::DropFog,
         (Masks::Drop, ..) => MaskPolicy::DropWhereBackground,
-    }
-}
-
-fn grid_input(
-    sequence: &SequenceInfo,
-    grid: &SelectedGrid,
-    tree: SequenceTree,
-    settings: &Settings,
-) -> GridInput {
-    let frames = grid.frames.iter().map(|&i| {
-        let frame = &sequence.frames[i];
-        let info = find(&frame.grids, &grid.source).expect("the grid was selected in this frame");
-        let transform = info.transform.matrix.expect("the grid was selected for its linear map");
-        FrameInput { number: frame.number, source: i as u32, transform }
-    });
-    GridInput {
-        name: grid.name.clone(),
-        class: grid.class,
-        is_integer: grid.is_integer,
-        fps: settings.fps.unwrap_or(0.0),
-        frames: frames.collect(),
-        tree,
-        allocation: None,
     }
 }

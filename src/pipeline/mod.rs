@@ -1,6 +1,7 @@
 //! Strings the stages together.
 
 mod allocation;
+mod cached_bricks;
 mod explain;
 mod frames;
 mod memory;
@@ -16,14 +17,19 @@ use serde::Serialize;
 use crate::cache::{Cache, Uses};
 use crate::error::{Error, Result};
 use crate::pack::{FinishedPack, Grid, Pack, Provenance, Source};
+pub use crate::progress::{Progress, Silent};
 use crate::report::PackSummary;
 pub use crate::report::model::Made;
 use crate::report::model::{BuildReport, StageSeconds};
 use crate::settings::{Format, NOT_WITH_ADAPTIVE, Settings};
-use crate::stages::metadata::{self, Digests, SequenceInfo};
-use crate::stages::quantise::QuantiseError;
-use crate::stages::select::{Selection, select};
-use crate::stages::serialise::{GridInput, SerialiseError, serialise};
+use crate::stages::allocate::Allocation;
+use crate::stages::dedup::SequenceTree;
+use crate::stages::encoder_cache::EncoderCache;
+use crate::stages::metadata::{self, Digests, KnownDigests, SequenceInfo};
+use crate::stages::quantise::{GridBricks, quantise};
+use crate::stages::relayout::place;
+use crate::stages::select::{GridFacts, Selection, select};
+use crate::stages::serialise::{GridParts, Serialiser, compress_slab};
 use crate::verify::{self, PictureSettings, Sources, VerifyReport};
 use crate::volume::ScratchFolder;
 pub use explain::{Explanation, StagePlan, explain};
@@ -94,21 +100,6 @@ impl Job {
         }
     }
 }
-
-/// Hears how a build is getting on, of what it cares for. Called from one thread at a time, not always the same.
-pub trait Progress: Send {
-    /// A stage begins, which has that many steps of that kind.
-    fn stage(&mut self, _name: &'static str, _steps: u64, _unit: &'static str) {}
-    /// That many more steps of the stage are done.
-    fn advance(&mut self, _steps: u64) {}
-    /// Something is odd but does not stop the build.
-    fn warn(&mut self, _warning: &str) {}
-}
-
-/// Progress that nobody hears of.
-pub struct Silent;
-
-impl Progress for Silent {}
 
 /// What a build did.
 pub struct Outcome {
@@ -189,7 +180,7 @@ fn build_cached(
         error => error,
     };
     let reused = match &mut reuse {
-        Some(reuse) => reuse.find(job, &plan.provenance)?,
+        Some(reuse) => reuse.find(job, &plan.provenance, &progress.cancel_token())?,
         None => Reused::Nothing,
     };
     let (made, finished) = match reused {
@@ -266,7 +257,10 @@ fn plan(job: &Job, progress: &mut dyn Progress) -> Result<(Plan, Vec<String>)> {
         return Err(Error::Usage(NOT_WITH_ADAPTIVE.to_owned()));
     }
     progress.stage("metadata", job.frames.len() as u64, "files");
-    let digests = Digests { cache: job.cache.as_deref(), paranoid: job.paranoid };
+    let digests = Digests {
+        known: job.cache.as_deref().map(|cache| cache as &dyn KnownDigests),
+        paranoid: job.paranoid,
+    };
     let sequence = metadata::read(&job.frames, digests)?;
     let selection = select(&sequence, &job.settings.grids, job.settings.integers)?;
     let warnings = [&sequence.warnings[..], &selection.warnings].concat();
@@ -274,7 +268,7 @@ fn plan(job: &Job, progress: &mut dyn Progress) -> Result<(Plan, Vec<String>)> {
     Ok((Plan { sequence, selection, provenance }, warnings))
 }
 
-/// Stages 3 to 8.
+/// Stages 3 to 8, in order. The cache is around them: what it has of frames and bricks is not made.
 fn run_stages(
     job: &Job,
     cache: Option<&Arc<Cache>>,
@@ -283,36 +277,77 @@ fn run_stages(
     clock: &mut Clock,
     progress: &mut dyn Progress,
 ) -> Result<FinishedPack> {
-    progress.stage("flatten", plan.sequence.frames.len() as u64, "frames");
-    let mut grids = frames::read(job, plan, cache, alter, progress)?;
+    let (Plan { sequence, selection, provenance }, settings) = (plan, &job.settings);
+    let facts: Vec<_> = selection.grids.iter().map(|grid| grid.facts(sequence, settings.fps)).collect();
+    progress.stage("flatten", sequence.frames.len() as u64, "frames");
+    let mut trees = frames::read(job, plan, cache, alter, progress)?;
     clock.lap("flatten and dedup");
-    let caches = frames::caches(&plan.sequence, &plan.selection, &job.settings, cache);
     // On a thread of the pool, since what follows goes to the pool some hundred times: from outside each time means to be
     // put to sleep and woken.
     rayon::scope(|_| {
-        allocation::allocate(&mut grids, &job.settings, caches, progress)?;
+        let cancel = progress.cancel_token();
+        let mut encoders = allocation::encoders(&facts, &trees, settings, &cancel)?;
+        let caches = frames::caches(sequence, selection, settings, cache);
+        let wrap = |(encoders, cache): (&mut EncoderCache, Option<_>)| {
+            cache.map(|cache| cached_bricks::wrap(encoders, cache))
+        };
+        let offers: Vec<_> = encoders.iter_mut().zip(caches).map(wrap).collect();
+
+        let allocations =
+            allocation::allocate(&facts, &mut trees, &mut encoders, &offers, settings, progress)?;
+        for (tree, allocation) in trees.iter_mut().zip(&allocations) {
+            if allocation.has_empty_bricks() {
+                tree.prune(|id| allocation.is_empty_brick(id))?;
+            }
+        }
+        let placement = place(&allocations.iter().collect::<Vec<_>>());
+        allocation::check_size(&facts, &trees, placement.bytes(), settings)?;
         // Written while slabs are encoded.
-        save(&mut grids)?;
+        save(&mut encoders, &trees)?;
         clock.lap("allocate");
-        let bricks: u64 = grids.iter().map(|g| u64::from(g.tree.pool.len())).sum();
-        progress.stage("encode", bricks, "bricks");
-        let level = (job.settings.zstd != 0).then_some(job.settings.zstd);
-        let finished =
-            serialise(&job.output, &mut grids, &plan.provenance, level, |bricks| progress.advance(bricks))
-                .map_err(|e| serialise_error(e, &grids, &job.output))?;
-        save(&mut grids)?;
+
+        progress.stage("encode", trees.iter().map(|tree| u64::from(tree.pool.len())).sum(), "bricks");
+        let level = (settings.zstd != 0).then_some(settings.zstd);
+        let parts = parts(&facts, &trees, &allocations);
+        let mut serialiser = Serialiser::begin(&job.output, &parts, &placement, provenance, level)?;
+        let bricks = facts.iter().zip(&mut trees).zip(&allocations).zip(&mut encoders);
+        let mut bricks: Vec<GridBricks> = bricks
+            .map(|(((facts, tree), allocation), encoders)| GridBricks {
+                name: &facts.name,
+                tree,
+                allocation,
+                encoders,
+            })
+            .collect();
+        let encoded = quantise(
+            &placement,
+            &mut bricks,
+            &cancel,
+            |atlas, slab| compress_slab(atlas, slab, level).map_err(Error::io(&job.output)),
+            |atlas, slab, chunk| {
+                serialiser.slab(slab, &chunk)?;
+                progress.advance(atlas.slab_bricks().into());
+                Ok(())
+            },
+        )?;
+        let finished = serialiser.finish(&self::parts(&facts, &trees, &allocations), &placement, &encoded)?;
+        save(&mut encoders, &trees)?;
         Ok(finished)
     })
 }
 
+fn parts<'a>(
+    facts: &'a [GridFacts],
+    trees: &'a [SequenceTree],
+    allocations: &'a [Allocation],
+) -> Vec<GridParts<'a>> {
+    let each = facts.iter().zip(trees).zip(allocations);
+    each.map(|((facts, tree), allocation)| GridParts { facts, tree, allocation }).collect()
+}
+
 /// Keeps what was made of bricks.
-fn save(grids: &mut [GridInput]) -> Result<()> {
-    for grid in grids {
-        if let Some(allocation) = &mut grid.allocation {
-            allocation.encodings.save(&grid.tree).map_err(Error::io(grid.tree.scratch.path()))?;
-        }
-    }
-    Ok(())
+fn save(encoders: &mut [EncoderCache], trees: &[SequenceTree]) -> Result<()> {
+    Ok(encoders.iter_mut().zip(trees).try_for_each(|(encoders, tree)| encoders.save(tree))?)
 }
 
 /// Opens a pack and checks as much of it as the job asks.
@@ -366,9 +401,9 @@ pub fn verify_against(
     progress.stage("verify", files.len() as u64, "frames");
     let sources = Sources::find(pack, files)?;
     let at_once = memory::compared_at_once(pack, files, resources)?;
-    let mut report = verify::voxels(pack, &sources, at_once, |frames| progress.advance(frames))?;
+    let mut report = verify::voxels(pack, &sources, at_once, progress)?;
     if let Some(settings) = pictures {
-        report.add_pictures(verify::pictures(pack, &sources, settings)?);
+        report.add_pictures(verify::pictures(pack, &sources, settings, &progress.cancel_token())?);
     }
     Ok(report)
 }
@@ -417,17 +452,5 @@ fn provenance(sequence: &SequenceInfo, settings: &Settings) -> Provenance {
                 blake3: f.digest.to_hex().to_string(),
             })
             .collect(),
-    }
-}
-
-fn serialise_error(error: SerialiseError, grids: &[GridInput], output: &Path) -> Error {
-    match error {
-        SerialiseError::Io(source) | SerialiseError::Quantise(QuantiseError::Io(source)) => {
-            Error::io(output)(source)
-        }
-        SerialiseError::Quantise(QuantiseError::OutOfRange { grid, source }) => {
-            Error::OutOfRange { grid: grids[grid].name.clone(), source }
-        }
-        SerialiseError::TooLarge { .. } => Error::Unsupported(error.to_string()),
     }
 }

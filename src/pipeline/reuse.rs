@@ -3,13 +3,15 @@
 use std::path::Path;
 
 use super::{Job, Made, VerifyLevel};
-use crate::cache::{Blob, Cache, Key, Stage, Stamp};
+use crate::cache::{Blob, Cache, Key, Stage};
+use crate::cancel::CancelToken;
 use crate::error::{Error, Result};
-use crate::pack::{FinishedPack, Pack, PackError, Provenance, repack};
+use crate::file_stamp::Stamp;
+use crate::pack::{FinishedPack, Pack, PackError, Provenance, RepackError, repack};
 use crate::render::Device;
 use crate::render::gpu::Gpu;
 use crate::settings::Settings;
-use crate::stages::metadata::{Digests, digest};
+use crate::stages::metadata::{Digests, KnownDigests, digest};
 use crate::verify::VerifyReport;
 
 const PACK: Stage = Stage { name: "pack", version: 1, travels: true };
@@ -18,6 +20,16 @@ const ANY_LEVEL: Stage = Stage { name: "pack-any-zstd", version: 1, travels: tru
 const VERIFY: Stage = Stage { name: "verify", version: 4, travels: true };
 /// A verification whose pictures were traced by the CPU alone, since no device could.
 const VERIFY_ON_CPU: Stage = Stage { name: "verify-on-cpu", version: 2, travels: true };
+
+impl KnownDigests for Cache {
+    fn remembered(&self, path: &Path, stamp: &Stamp) -> Option<blake3::Hash> {
+        self.remembered(path, stamp)
+    }
+
+    fn remember(&self, path: &Path, stamp: &Stamp, digest: &blake3::Hash) {
+        self.remember(path, stamp, digest);
+    }
+}
 
 /// What the cache may have for a job.
 pub(super) struct Reuse<'a> {
@@ -58,7 +70,7 @@ impl<'a> Reuse<'a> {
     }
 
     /// The pack, if it is there already, in the cache, or there at another level of zstd.
-    pub fn find(&mut self, job: &Job, provenance: &Provenance) -> Result<Reused> {
+    pub fn find(&mut self, job: &Job, provenance: &Provenance, cancel: &CancelToken) -> Result<Reused> {
         self.pack = self.cache.blob(&self.exact);
         let found = match self.pack {
             Some(blob) if self.is_at(&job.output, &blob, job.paranoid) => Reused::Unchanged,
@@ -66,7 +78,7 @@ impl<'a> Reuse<'a> {
             None => Reused::Nothing,
         };
         let found = match found {
-            Reused::Nothing => self.repack(job, provenance)?,
+            Reused::Nothing => self.repack(job, provenance, cancel)?,
             found => found,
         };
         self.cache.count(&self.exact, !matches!(found, Reused::Nothing));
@@ -91,7 +103,7 @@ impl<'a> Reuse<'a> {
         if stamp.bytes() != blob.bytes {
             return false;
         }
-        let digests = Digests { cache: Some(self.cache), paranoid };
+        let digests = Digests { known: Some(self.cache), paranoid };
         digests.of(path, &stamp, stamp.is_settled()).is_ok_and(|digest| digest == blob.digest)
     }
 
@@ -100,7 +112,7 @@ impl<'a> Reuse<'a> {
             .map_err(Error::io(&job.output))
     }
 
-    fn repack(&self, job: &Job, provenance: &Provenance) -> Result<Reused> {
+    fn repack(&self, job: &Job, provenance: &Provenance, cancel: &CancelToken) -> Result<Reused> {
         let Some(blob) = self.cache.blob(&self.any_level) else { return Ok(Reused::Nothing) };
         let Some(copy) = self.copy(job, &blob)? else { return Ok(Reused::Nothing) };
         let level = (job.settings.zstd != 0).then_some(job.settings.zstd);
@@ -108,11 +120,12 @@ impl<'a> Reuse<'a> {
         let pack = Pack::open(copy.path()).ok();
         let is_wanted = |found: &Provenance| any_level(provenance).is(&any_level(found));
         let pack = pack.filter(|pack| pack.provenance().is_ok_and(|found| is_wanted(&found)));
-        let pack = pack.map(|pack| repack(&pack, &job.output, provenance, level)).transpose();
+        let pack = pack.map(|pack| repack(&pack, &job.output, provenance, level, cancel)).transpose();
         match pack {
             Ok(Some(pack)) => Ok(Reused::Pack(Made::Repacked, pack)),
-            Err(PackError::Io(e)) => Err(Error::io(&job.output)(e)),
-            Ok(None) | Err(_) => Ok(Reused::Nothing),
+            Err(RepackError::Pack(PackError::Io(e))) => Err(Error::io(&job.output)(e)),
+            Err(RepackError::Cancelled(e)) => Err(e.into()),
+            Ok(None) | Err(RepackError::Pack(_)) => Ok(Reused::Nothing),
         }
     }
 

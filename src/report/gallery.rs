@@ -6,6 +6,7 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::cache::{Cache, Key, Stage};
+use crate::cancel::CancelToken;
 use crate::error::{Error, Result};
 use crate::pack::{Grid, Pack};
 use crate::render::{DecodedFrame, Mode, Scene, View, trace, write_png};
@@ -81,6 +82,7 @@ pub fn gallery(
     files: Option<&[PathBuf]>,
     found: Option<&VerifyReport>,
     cache: Option<&Cache>,
+    cancel: &CancelToken,
 ) -> Result<Gallery> {
     let worst = found.and_then(|found| found.worst_frame.as_ref());
     let worst = worst.map(|worst| (worst.grid.as_str(), worst.frame));
@@ -110,7 +112,7 @@ pub fn gallery(
         Ok(Some(KeyFrame::new(&pack.grids[place[0]], place[1], is_worst, &seen)))
     };
     let key_frames = places.into_par_iter().map(key_frame);
-    let strips = extinctions.iter().enumerate().map(|(g, extinction)| strip(pack, g, *extinction));
+    let strips = extinctions.iter().enumerate().map(|(g, extinction)| strip(pack, g, *extinction, cancel));
     let gallery = Gallery {
         key_frames: key_frames.collect::<Result<Vec<_>>>()?.into_iter().flatten().collect(),
         strips: strips.collect::<Result<Vec<_>>>()?.into_iter().flatten().collect(),
@@ -137,7 +139,7 @@ impl KeyFrame {
 }
 
 /// `None` for a grid of less than two frames, where there is nothing to play, and for one that cannot be traced.
-fn strip(pack: &Pack, g: usize, extinction: Option<f64>) -> Result<Option<Strip>> {
+fn strip(pack: &Pack, g: usize, extinction: Option<f64>, cancel: &CancelToken) -> Result<Option<Strip>> {
     let grid = &pack.grids[g];
     let all = grid.frames.len();
     if all < 2 {
@@ -147,7 +149,7 @@ fn strip(pack: &Pack, g: usize, extinction: Option<f64>) -> Result<Option<Strip>
     let frames: Vec<usize> = (0..count).map(|i| i * (all - 1) / (count - 1)).collect();
     let mode = Mode::of_grid(grid);
     let draw = |&f: &usize| -> Result<Option<Vec<u8>>> {
-        crate::interrupt::check()?;
+        cancel.check()?;
         let field = pack.frame(g, f).and_then(|reader| DecodedFrame::from_pack(&reader)).map_err(|e| {
             Error::Verify(format!("grid {:?} frame {}: {e}", grid.name, grid.frames[f].record.number))
         })?;

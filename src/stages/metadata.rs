@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
-use crate::cache::{Cache, Stamp};
 use crate::error::{Error, Result};
+use crate::file_stamp::Stamp;
 use crate::sequence::{Numbering, number};
 use crate::vdb::{GridInfo, VdbFile};
 
@@ -61,11 +61,19 @@ pub struct SequenceInfo {
     pub warnings: Vec<String>,
 }
 
+/// Remembers the digests of files, so that gigabytes are not hashed to find that nothing changed.
+pub trait KnownDigests: Sync {
+    /// The digest that a file had when it had this stamp, if it is remembered.
+    fn remembered(&self, path: &Path, stamp: &Stamp) -> Option<blake3::Hash>;
+    /// Remembers the digest that a file has under a stamp that was [settled](Stamp::is_settled) when it was taken.
+    fn remember(&self, path: &Path, stamp: &Stamp, digest: &blake3::Hash);
+}
+
 /// Where the digests of sources come from.
 #[derive(Clone, Copy, Default)]
 pub struct Digests<'a> {
     /// What remembers them.
-    pub cache: Option<&'a Cache>,
+    pub known: Option<&'a dyn KnownDigests>,
     /// Whether files that seem unchanged are hashed all the same.
     pub paranoid: bool,
 }
@@ -127,13 +135,14 @@ impl Digests<'_> {
     /// # Errors
     /// When the file cannot be read.
     pub fn of(self, path: &Path, stamp: &Stamp, is_settled: bool) -> Result<blake3::Hash> {
-        let remembered = self.cache.filter(|_| !self.paranoid).and_then(|c| c.remembered(path, stamp));
+        let remembered =
+            self.known.filter(|_| !self.paranoid).and_then(|known| known.remembered(path, stamp));
         if let Some(digest) = remembered {
             return Ok(digest);
         }
         let (digest, _) = digest(path)?;
-        if let Some(cache) = self.cache.filter(|_| is_settled) {
-            cache.remember(path, stamp, &digest);
+        if let Some(known) = self.known.filter(|_| is_settled) {
+            known.remember(path, stamp, &digest);
         }
         Ok(digest)
     }

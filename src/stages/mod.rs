@@ -6,16 +6,16 @@
 //! | 2 | [`select`], [`component`] | [`select::Selection`]: the grids to pack, their frames, and what of their values |
 //! | 3 | [`flatten`] | [`crate::volume::FlatFrame`]: cells and bricks of one frame |
 //! | 4 | [`dedup`] | [`dedup::SequenceTree`]: nodes and bricks shared across the sequence |
-//! | 5, 7 | [`encodings`] | what each codec makes of each brick, made once or taken from the cache |
+//! | 5, 7 | [`encoder_cache`] | what each codec makes of each brick, made once |
 //! | 5 | [`allocate`] | [`allocate::Allocation`]: which codec each brick gets, and its range |
-//! | 6 | [`relayout`] | [`relayout::Layout`]: where each brick lies in the pages of its codec's texture |
+//! | 6 | [`relayout`] | [`relayout::Placement`]: where each brick lies in the pages of its codec's texture |
 //! | 7 | [`quantise`] | encoded slabs of each atlas |
 //! | 8 | [`serialise`] | the `.volpack` file |
 
 pub mod allocate;
 pub mod component;
 pub mod dedup;
-pub mod encodings;
+pub mod encoder_cache;
 pub mod flatten;
 pub mod metadata;
 pub mod quantise;

@@ -1,61 +1,68 @@
 //! Stage 7: texels to the bytes of a codec, slab by slab.
 
-use std::io;
-
 use rayon::prelude::*;
 
-use super::allocate::{Allocation, Coding};
+use super::allocate::{Allocation, BrickErrors, Coding};
 use super::dedup::SequenceTree;
-use super::encodings::{KeptCodec, Kind, Tried};
-use super::relayout::{self, Cursor, Layout, Texture, TextureOf};
+use super::encoder_cache::{EncoderCache, KeptCodec, Kind, Tried};
+use super::relayout::{self, Cursor, Placement, Texture, TextureOf};
+use crate::cancel::CancelToken;
 use crate::codec::{self, Codec, OutOfRange, Texels, decode, encode};
+use crate::error::{Error, Result};
 use crate::pack::Atlas;
 use crate::profile;
-use crate::volume::Brick;
+use crate::volume::{Brick, ScratchResult};
 
-/// One grid's bricks and how they are coded.
+/// One grid's bricks, how they are coded, and what makes their texels.
 pub struct GridBricks<'a> {
-    /// The grid.
+    /// The grid's name.
+    pub name: &'a str,
+    /// Its bricks.
     pub tree: &'a mut SequenceTree,
-    /// Its codecs and ranges.
-    pub allocation: &'a mut Allocation,
-}
-
-/// The slabs cannot be encoded.
-#[derive(Debug, thiserror::Error)]
-pub enum QuantiseError {
-    /// Reading bricks back or writing slabs failed.
-    #[error(transparent)]
-    Io(#[from] io::Error),
-    /// A value that the codec cannot hold, in the grid at this place.
-    #[error("{source}")]
-    OutOfRange {
-        /// Which of the grids.
-        grid: usize,
-        /// The value.
-        source: OutOfRange,
-    },
+    /// Their codecs and ranges.
+    pub allocation: &'a Allocation,
+    /// Their encoders.
+    pub encoders: &'a mut EncoderCache,
 }
 
 /// What became of each brick of a grid.
-pub struct Outcome {
+pub struct EncodedGrid {
     /// Its packing axis, where it has texels of its own.
     axes: Vec<u8>,
+    /// Errors of bricks, where the allocation did not know them.
+    error_l2s: Option<BrickErrors>,
 }
 
-impl Outcome {
-    /// What is known before any slab is encoded.
-    pub fn before(allocation: &Allocation) -> Self {
-        Self { axes: vec![2; allocation.len() as usize] }
+impl EncodedGrid {
+    fn new(grid: &GridBricks) -> Result<Self> {
+        let allocation = grid.allocation;
+        let mut error_l2s = None;
+        if !allocation.error_l2s.are_known {
+            let mut errors = BrickErrors::new(&grid.tree.scratch);
+            // Those of clusters are known: quantising adds those of bricks that have texels of their own.
+            for id in (0..allocation.len()).filter(|&id| !matches!(allocation.coding(id), Coding::Own(_))) {
+                errors.put(id, &allocation.error_l2s.read(&[id])?)?;
+            }
+            error_l2s = Some(errors);
+        }
+        Ok(Self { axes: vec![2; allocation.len() as usize], error_l2s })
     }
 
     /// The packing axis of the texels that a brick reads.
     pub fn axis(&self, allocation: &Allocation, brick: u32) -> u8 {
         match allocation.coding(brick) {
             Coding::Borrowed(referenced) => self.axes[referenced as usize],
-            Coding::Shared(shape) => allocation.shapes[shape as usize].axis,
+            Coding::Clustered(shape) => allocation.shapes[shape as usize].axis,
             _ => self.axes[brick as usize],
         }
+    }
+
+    /// The roots of the squared errors of some bricks over the voxels that their texels give.
+    ///
+    /// # Errors
+    /// When the scratch file cannot be read back.
+    pub fn error_l2s(&self, allocation: &Allocation, ids: &[u32]) -> ScratchResult<Vec<f64>> {
+        self.error_l2s.as_ref().unwrap_or(&allocation.error_l2s).read(ids)
     }
 }
 
@@ -77,28 +84,30 @@ struct Slab<'a> {
 }
 
 /// Encodes every slab of every atlas in order. `finish` is applied to a slab's bytes on the thread that made
-/// them, `sink` to the results in order, each with its atlas and its place there. What becomes of each grid's bricks
-/// goes into `outcomes`, and their errors, where they were not known, to those of their allocation.
+/// them, `sink` to the results in order, each with its atlas and its place there.
 ///
 /// # Errors
-/// [`QuantiseError`].
+/// When bricks cannot be read, a value does not fit its codec, or the work is cancelled; and those of `finish` and
+/// `sink`.
 pub fn quantise<T: Send>(
-    layout: &Layout,
+    placement: &Placement,
     grids: &mut [GridBricks],
-    outcomes: &mut [Outcome],
-    finish: impl Fn(&Atlas, Vec<u8>) -> io::Result<T> + Sync,
-    mut sink: impl FnMut(&Atlas, u32, T) -> io::Result<()>,
-) -> Result<(), QuantiseError> {
-    let mut slabs = layout.atlases.iter().flat_map(|atlas| (0..atlas.slabs).map(move |slab| (atlas, slab)));
+    cancel: &CancelToken,
+    finish: impl Fn(&Atlas, Vec<u8>) -> Result<T> + Sync,
+    mut sink: impl FnMut(&Atlas, u32, T) -> Result<()>,
+) -> Result<Vec<EncodedGrid>> {
+    let mut encoded_grids: Vec<EncodedGrid> = grids.iter().map(EncodedGrid::new).collect::<Result<_>>()?;
+    let allocations: Vec<&Allocation> = grids.iter().map(|grid| grid.allocation).collect();
+    let mut slabs =
+        placement.atlases.iter().flat_map(|atlas| (0..atlas.slabs).map(move |slab| (atlas, slab)));
     let mut cursor = Cursor::default();
     loop {
-        crate::interrupt::check().map_err(io::Error::from)?;
-        let allocations: Vec<&Allocation> = grids.iter().map(|grid| &*grid.allocation).collect();
+        cancel.check()?;
         let slab = |(atlas, place)| {
             if place == 0 {
                 cursor = Cursor::default();
             }
-            Slab { atlas, place, textures: layout.textures(&allocations, atlas, place, &mut cursor) }
+            Slab { atlas, place, textures: placement.textures(&allocations, atlas, place, &mut cursor) }
         };
         // Some a thread: one of them may take longer than another.
         let group: Vec<Slab> =
@@ -118,47 +127,46 @@ pub fn quantise<T: Send>(
                 let Encoded { bytes, axes, error_l2s } = encode_slab(shared, slab)?;
                 Ok((finish(slab.atlas, relayout::assemble(slab.atlas, &bytes))?, axes, error_l2s))
             })
-            .collect::<Result<_, QuantiseError>>()?;
+            .collect::<Result<_>>()?;
         for ((bytes, axes, error_l2s), slab) in encoded.into_iter().zip(&group) {
             sink(slab.atlas, slab.place, bytes)?;
             for ((texture, axis), error_l2) in slab.textures.iter().zip(axes).zip(error_l2s) {
                 let Some(id) = texture.brick() else { continue };
-                let grid = texture.grid as usize;
-                outcomes[grid].axes[id as usize] = axis;
-                let all = &mut grids[grid].allocation.error_l2s;
-                if !all.are_known {
-                    all.put(id, &[error_l2])?;
+                let grid = &mut encoded_grids[texture.grid as usize];
+                grid.axes[id as usize] = axis;
+                if let Some(errors) = &mut grid.error_l2s {
+                    errors.put(id, &[error_l2])?;
                 }
             }
         }
     }
-    grids.iter_mut().try_for_each(|grid| grid.allocation.error_l2s.flush())?;
-    Ok(())
+    encoded_grids.iter_mut().filter_map(|grid| grid.error_l2s.as_mut()).try_for_each(BrickErrors::flush)?;
+    Ok(encoded_grids)
 }
 
 /// Slabs that are worked on together, for each thread.
 const AT_ONCE: usize = 2;
 
 /// Sees to it that the texels of some slots, which are kept, or else their bricks can be read.
-fn prepare(grids: &mut [GridBricks], codec: Codec, textures: &[Texture]) -> io::Result<()> {
-    for (g, GridBricks { tree, allocation }) in grids.iter_mut().enumerate() {
+fn prepare(grids: &mut [GridBricks], codec: Codec, textures: &[Texture]) -> Result<()> {
+    for (g, GridBricks { tree, encoders, .. }) in grids.iter_mut().enumerate() {
         let own = textures.iter().filter(|texture| texture.grid as usize == g).filter_map(Texture::brick);
         let ids: Vec<u32> = own.collect();
         match KeptCodec::of(codec) {
-            Some(kept) => allocation.encodings.make(tree, &ids, &[Kind::Texels(kept)], |_| ())?,
+            Some(kept) => encoders.make(tree, &ids, &[Kind::Texels(kept)], |_| ())?,
             None => tree.fetch(&ids)?,
         }
     }
     Ok(())
 }
 
-fn encode_slab(grids: &[GridBricks], slab: &Slab) -> Result<Encoded, QuantiseError> {
+fn encode_slab(grids: &[GridBricks], slab: &Slab) -> Result<Encoded> {
     let codec = slab.atlas.codec;
     let together = |a: &Texture, b: &Texture| a.grid == b.grid && a.brick().is_some() && b.brick().is_some();
     let mut all = Encoded::default();
     for run in slab.textures.chunk_by(together) {
         let grid = run[0].grid as usize;
-        let GridBricks { tree, allocation } = &grids[grid];
+        let GridBricks { name, tree, allocation, encoders } = &grids[grid];
         if let TextureOf::Shape(shape) = run[0].of {
             let shape = &allocation.shapes[shape as usize];
             all.add(Encoded { bytes: shape.bytes.clone(), axes: vec![shape.axis], error_l2s: vec![0.0] });
@@ -167,13 +175,13 @@ fn encode_slab(grids: &[GridBricks], slab: &Slab) -> Result<Encoded, QuantiseErr
         let ids: Vec<u32> = run.iter().filter_map(Texture::brick).collect();
         all.add(match KeptCodec::of(codec) {
             Some(kept) => {
-                let Tried { costs, bytes, axes } = allocation.encodings.texels(&ids, kept)?;
+                let Tried { costs, bytes, axes } = encoders.texels(&ids, kept)?;
                 Encoded { bytes, axes, error_l2s: costs.iter().map(|cost| cost.error_l2).collect() }
             }
             None => {
                 let bricks = tree.pool.read(&ids)?;
                 let encoded = encode_bricks(codec, &grids[grid], &ids, &bricks);
-                encoded.map_err(|source| QuantiseError::OutOfRange { grid, source })?
+                encoded.map_err(|source| Error::OutOfRange { grid: (*name).to_owned(), source })?
             }
         });
     }
@@ -200,9 +208,8 @@ fn encode_bricks(
     bricks: &[Brick],
 ) -> Result<Encoded, OutOfRange> {
     let sequence = &grid.allocation.sequence;
-    let encodings = &grid.allocation.encodings;
     let texels: Vec<Texels> =
-        ids.iter().zip(bricks).map(|(&id, brick)| encodings.prepare(grid.tree, id, brick)).collect();
+        ids.iter().zip(bricks).map(|(&id, brick)| grid.encoders.prepare(grid.tree, id, brick)).collect();
     let codec::Encoded { bytes, axes } = encode(codec, sequence, &texels)?;
     let each = bricks.iter().zip(&texels).zip(bytes.chunks_exact(codec.layout().brick_bytes())).zip(&axes);
     let error_l2 = |(((brick, texels), bytes), &axis): (((&Brick, &Texels), &[u8]), &u8)| match codec {

@@ -6,7 +6,7 @@ use crate::error::{Error, Result};
 use crate::settings::Integers;
 use crate::stages::component::{Component, packed_as};
 use crate::stages::metadata::SequenceInfo;
-use crate::vdb::{GridClass, GridInfo};
+use crate::vdb::{GridClass, GridInfo, voxel_size};
 
 /// The grid that is packed when none is named and several could be.
 const DEFAULT_GRID: &str = "density";
@@ -35,6 +35,57 @@ pub struct SelectedGrid {
     pub class: GridClass,
     /// The frames, by their place in the sequence, in which it exists.
     pub frames: Vec<usize>,
+}
+
+/// What is known of a grid before a voxel is read.
+pub struct GridFacts {
+    /// Its name in the pack.
+    pub name: String,
+    /// What kind of field it holds.
+    pub class: GridClass,
+    /// Whether its source's values are integers.
+    pub is_integer: bool,
+    /// Frames per second; 0 when not stated.
+    pub fps: f32,
+    /// Its frames, in order.
+    pub frames: Vec<FrameFacts>,
+}
+
+/// What is known of one frame of a grid before a voxel is read.
+#[derive(Clone, Debug)]
+pub struct FrameFacts {
+    /// Its number.
+    pub number: i32,
+    /// Its source's place in the sequence.
+    pub source: u32,
+    /// Index space to world space.
+    pub transform: [f64; 16],
+}
+
+impl GridFacts {
+    /// The smallest side of a voxel in any frame, in world units.
+    pub fn smallest_voxel(&self) -> f64 {
+        self.frames.iter().map(|frame| voxel_size(&frame.transform)).fold(f64::INFINITY, f64::min)
+    }
+}
+
+impl SelectedGrid {
+    /// What is known of it.
+    pub fn facts(&self, sequence: &SequenceInfo, fps: Option<f32>) -> GridFacts {
+        let frame = |&i: &usize| {
+            let frame = &sequence.frames[i];
+            let info = find(&frame.grids, &self.source).expect("the grid was selected in this frame");
+            let transform = info.transform.matrix.expect("the grid was selected for its linear map");
+            FrameFacts { number: frame.number, source: i as u32, transform }
+        };
+        GridFacts {
+            name: self.name.clone(),
+            class: self.class,
+            is_integer: self.is_integer,
+            fps: fps.unwrap_or(0.0),
+            frames: self.frames.iter().map(frame).collect(),
+        }
+    }
 }
 
 /// One file of a sequence, as far as grids are chosen by it.

@@ -128,8 +128,12 @@ fn point(
         seconds = seconds.min(start.elapsed().as_secs_f64());
     }
     let pack = Pack::open(&job.output).map_err(Error::pack(&job.output))?;
-    let report =
-        verify::voxels(&pack, &Sources::find(&pack, &options.frames)?, rayon::current_num_threads(), |_| ())?;
+    let report = verify::voxels(
+        &pack,
+        &Sources::find(&pack, &options.frames)?,
+        rayon::current_num_threads(),
+        &mut Silent,
+    )?;
     let mut jumps = Jumps::default();
     for (place, bricks) in &source.shown {
         let Some(frame) = pack.grids[0].frames.iter().position(|f| f.record.source as usize == *place) else {

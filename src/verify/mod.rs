@@ -24,6 +24,7 @@ pub use pictures::{
 
 use crate::error::{Error, Result};
 use crate::pack::{Frame, Grid, Pack, Provenance};
+use crate::progress::Progress;
 use crate::settings::Settings;
 use crate::stages::component::find_packed;
 use crate::stages::metadata::digest;
@@ -58,8 +59,8 @@ impl Sources {
     }
 }
 
-/// Compares every voxel of every frame with the pack's sources, so many of them at a time. `advance` hears of each source
-/// file that is done.
+/// Compares every voxel of every frame with the pack's sources, so many of them at a time. A step of `progress` is a source
+/// file.
 ///
 /// # Errors
 /// When a source is unreadable, or a chunk of the pack is damaged. Differences are no error: they are in
@@ -68,16 +69,17 @@ pub fn voxels(
     pack: &Pack,
     sources: &Sources,
     at_once: usize,
-    mut advance: impl FnMut(u64),
+    progress: &mut dyn Progress,
 ) -> Result<VerifyReport> {
     let Sources { files: paths, provenance } = sources;
     let settings = &provenance.settings;
+    let cancel = progress.cancel_token();
     let mut found: Vec<Vec<Option<FoundFrame>>> =
         pack.grids.iter().map(|g| g.frames.iter().map(|_| None).collect()).collect();
     let mut failures = check_tables(pack, provenance);
     let places: Vec<usize> = (0..paths.len()).collect();
     for window in places.chunks(at_once) {
-        crate::interrupt::check()?;
+        cancel.check()?;
         let results: Vec<_> =
             window.par_iter().map(|&source| compare_source(pack, settings, source, &paths[source])).collect();
         for result in results {
@@ -87,7 +89,7 @@ pub fn voxels(
                 let [g, f] = frame.place;
                 found[g][f] = Some(frame);
             }
-            advance(1);
+            progress.advance(1);
         }
     }
     let mut errors = Vec::new();

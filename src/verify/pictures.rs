@@ -10,6 +10,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::Sources;
+use crate::cancel::CancelToken;
 use crate::error::{Error, Result};
 use crate::pack::{Grid, Pack};
 use crate::render::{
@@ -109,7 +110,12 @@ pub struct TracerDifference {
 /// # Errors
 /// When a source or a chunk of the pack cannot be read, a picture not be written, or a device fails.
 /// Differences are no error: they are in the report.
-pub fn pictures(pack: &Pack, sources: &Sources, settings: &PictureSettings) -> Result<PicturesReport> {
+pub fn pictures(
+    pack: &Pack,
+    sources: &Sources,
+    settings: &PictureSettings,
+    cancel: &CancelToken,
+) -> Result<PicturesReport> {
     let renderer = Renderer::new(pack, settings.device).map_err(|e| Error::Unsupported(e.to_string()))?;
     let mut report = PicturesReport {
         device: renderer.is_gpu().then(|| renderer.device_name().to_owned()),
@@ -124,7 +130,7 @@ pub fn pictures(pack: &Pack, sources: &Sources, settings: &PictureSettings) -> R
         std::fs::create_dir_all(folder).map_err(Error::io(folder))?;
     }
     for g in 0..pack.grids.len() {
-        compare_grid(pack, sources, &renderer, g, settings, &mut report)?;
+        compare_grid(pack, sources, &renderer, g, settings, &mut report, cancel)?;
     }
     Ok(report)
 }
@@ -150,12 +156,13 @@ fn compare_grid(
     g: usize,
     settings: &PictureSettings,
     report: &mut PicturesReport,
+    cancel: &CancelToken,
 ) -> Result<()> {
     let grid = &pack.grids[g];
     let what = |f: usize| format!("grid {:?} frame {}", grid.name, grid.frames[f].record.number);
     let mut shown = Vec::new();
     for f in shown_frames(grid.frames.len()) {
-        crate::interrupt::check()?;
+        cancel.check()?;
         let scene = scene(grid, f);
         match source_picture(&source_field(pack, sources, [g, f])?, &scene) {
             Ok(picture) => shown.push((f, scene, picture)),
@@ -165,7 +172,7 @@ fn compare_grid(
     let Some((_, scene, _)) = shown.first() else { return Ok(()) };
     let extinction = visible_extinction(scene.extinction, shown.iter().map(|(.., picture)| picture));
     for (f, scene, of_source) in shown {
-        crate::interrupt::check()?;
+        cancel.check()?;
         let scene = Scene { extinction, ..scene };
         let of_source = of_source.at(&scene);
         let field = packed_field(pack, [g, f])?;

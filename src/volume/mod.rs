@@ -19,5 +19,5 @@ pub use frame::{Cell, CellContent, Child, Constant, FlatFrame, FrameStats, Value
 pub use list::List;
 pub use mask::{Mask512, bits};
 pub use pool::{BRICKS_IN_FLIGHT, BrickPool, Interner};
-pub use scratch::{SCRATCH_SMALL, Scratch, ScratchFolder};
+pub use scratch::{SCRATCH_SMALL, Scratch, ScratchError, ScratchFolder, ScratchResult};
 pub use sparse::SortedMap;

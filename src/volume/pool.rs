@@ -1,13 +1,12 @@
 //! The unique bricks of a sequence: little of each in memory, the rest in scratch files.
 
 use std::collections::HashMap;
-use std::io;
 
 use bytemuck::{Pod, Zeroable};
 use hashbrown::HashTable;
 use xxhash_rust::xxh3::{xxh3_64, xxh3_128};
 
-use super::{BRICK_VOXELS, Brick, List, Mask512, SCRATCH_SMALL, Scratch, ScratchFolder};
+use super::{BRICK_VOXELS, Brick, List, Mask512, SCRATCH_SMALL, Scratch, ScratchFolder, ScratchResult};
 
 /// Bricks that are worked on before what was made of them is put away: enough batches of an encoder for every core.
 pub const BRICKS_IN_FLIGHT: u32 = 4096;
@@ -110,7 +109,7 @@ impl BrickPool {
         active: &Mask512,
         keeps_mask: bool,
         place: u32,
-    ) -> io::Result<(u32, bool)> {
+    ) -> ScratchResult<(u32, bool)> {
         if let Some((id, mut facts)) = self.find(digest)? {
             // Without a kept mask bricks are one if their values are. The pool's counts as active what is
             // active in any of them.
@@ -130,7 +129,7 @@ impl BrickPool {
         Ok((id, true))
     }
 
-    fn find(&self, digest: &[u8; 32]) -> io::Result<Option<(u32, Facts)>> {
+    fn find(&self, digest: &[u8; 32]) -> ScratchResult<Option<(u32, Facts)>> {
         let start = start(digest);
         for &id in self.by_digest.iter_hash(start).filter(|id| self.starts[**id] == start) {
             let facts: Facts = self.facts.get(id)?;
@@ -145,7 +144,7 @@ impl BrickPool {
     ///
     /// # Errors
     /// When the scratch file cannot be written.
-    pub fn seal(&mut self) -> io::Result<()> {
+    pub fn seal(&mut self) -> ScratchResult<()> {
         self.by_digest = HashTable::new();
         self.starts = List::default();
         self.facts.flush()?;
@@ -156,7 +155,7 @@ impl BrickPool {
     ///
     /// # Errors
     /// When the scratch file cannot be written.
-    pub fn flush(&mut self) -> io::Result<()> {
+    pub fn flush(&mut self) -> ScratchResult<()> {
         self.values.flush()
     }
 
@@ -164,7 +163,7 @@ impl BrickPool {
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn digests(&self, ids: &[u32]) -> io::Result<Vec<[u8; 32]>> {
+    pub fn digests(&self, ids: &[u32]) -> ScratchResult<Vec<[u8; 32]>> {
         let facts = self.facts.read_as::<Facts>(ids)?;
         Ok(facts.into_iter().map(|facts| facts.digest).collect())
     }
@@ -183,7 +182,7 @@ impl BrickPool {
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn active_hashes(&self, ids: &[u32]) -> io::Result<Vec<u64>> {
+    pub fn active_hashes(&self, ids: &[u32]) -> ScratchResult<Vec<u64>> {
         let facts = self.facts.read_as::<Facts>(ids)?;
         Ok(facts.iter().map(|facts| hash(&facts.active)).collect())
     }
@@ -197,7 +196,7 @@ impl BrickPool {
     ///
     /// # Errors
     /// When the scratch file cannot be written.
-    pub fn put(&mut self, id: u32, values: &[f32; BRICK_VOXELS]) -> io::Result<()> {
+    pub fn put(&mut self, id: u32, values: &[f32; BRICK_VOXELS]) -> ScratchResult<()> {
         self.bricks[id].0 |= Known::IS_THERE;
         self.values.put(id, bytemuck::bytes_of(values))
     }
@@ -206,7 +205,7 @@ impl BrickPool {
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn read(&self, ids: &[u32]) -> io::Result<Vec<Brick>> {
+    pub fn read(&self, ids: &[u32]) -> ScratchResult<Vec<Brick>> {
         let mut out = Vec::with_capacity(ids.len());
         let facts = self.facts.read_as::<Facts>(ids)?;
         let mut each = ids.iter().zip(facts);

@@ -18,6 +18,19 @@ const GAP: u64 = 16 << 10;
 /// second.
 pub const SCRATCH_SMALL: usize = 256 << 10;
 
+/// A spill file that could not be made, written or read back.
+#[derive(Debug, thiserror::Error)]
+#[error("{}: {source}", folder.display())]
+pub struct ScratchError {
+    /// The folder of the file, which has no name.
+    pub folder: PathBuf,
+    /// Why.
+    pub source: io::Error,
+}
+
+/// `Result` with a [`ScratchError`].
+pub type ScratchResult<T> = Result<T, ScratchError>;
+
 /// Where scratch files are made. They have no name, so that a process that is killed leaves none.
 #[derive(Clone, Debug)]
 pub struct ScratchFolder {
@@ -96,7 +109,7 @@ impl Scratch {
     ///
     /// # Errors
     /// When the file cannot be written.
-    pub fn put(&mut self, place: u32, records: &[u8]) -> io::Result<()> {
+    pub fn put(&mut self, place: u32, records: &[u8]) -> ScratchResult<()> {
         debug_assert!(records.len().is_multiple_of(self.record));
         let record = self.record;
         let count = |bytes: &[u8]| (bytes.len() / record) as u32;
@@ -116,14 +129,14 @@ impl Scratch {
     ///
     /// # Errors
     /// When the file cannot be written.
-    pub fn flush(&mut self) -> io::Result<()> {
+    pub fn flush(&mut self) -> ScratchResult<()> {
         self.empty_buffer()?;
         // There may be nothing more for long.
         self.buffer = Vec::new();
         Ok(())
     }
 
-    fn empty_buffer(&mut self) -> io::Result<()> {
+    fn empty_buffer(&mut self) -> ScratchResult<()> {
         let mut buffer = std::mem::take(&mut self.buffer);
         if !buffer.is_empty() {
             self.write(self.at(self.buffered), &buffer)?;
@@ -134,7 +147,7 @@ impl Scratch {
         Ok(())
     }
 
-    fn write(&mut self, at: u64, bytes: &[u8]) -> io::Result<()> {
+    fn write(&mut self, at: u64, bytes: &[u8]) -> ScratchResult<()> {
         let end = at as usize + bytes.len();
         if let Store::Memory(all) = &mut self.store {
             if end <= self.small {
@@ -142,27 +155,27 @@ impl Scratch {
                 all[at as usize..end].copy_from_slice(bytes);
                 return Ok(());
             }
-            let file = self.folder.file()?;
-            write_at(&file, all, 0)?;
+            let moved = self.folder.file().and_then(|file| write_at(&file, all, 0).map(|()| file));
+            let file = moved.map_err(self.failed())?;
             self.store = Store::File(file);
         }
         match &self.store {
-            Store::File(file) => write_at(file, bytes, at),
+            Store::File(file) => write_at(file, bytes, at).map_err(self.failed()),
             Store::Memory(_) => unreachable!("it is a file from now on"),
         }
     }
 
-    fn load(&self, at: u64, bytes: &mut [u8]) -> io::Result<()> {
+    fn load(&self, at: u64, bytes: &mut [u8]) -> ScratchResult<()> {
         match &self.store {
             Store::Memory(all) => {
                 bytes.copy_from_slice(&all[at as usize..][..bytes.len()]);
                 Ok(())
             }
-            Store::File(file) => read_at(file, bytes, at),
+            Store::File(file) => read_at(file, bytes, at).map_err(self.failed()),
         }
     }
 
-    fn load_span(&self, places: &[u32], bytes: &mut Vec<u8>) -> io::Result<u64> {
+    fn load_span(&self, places: &[u32], bytes: &mut Vec<u8>) -> ScratchResult<u64> {
         let first = self.at(places[0]);
         bytes.resize((self.at(places[places.len() - 1]) - first) as usize + self.record, 0);
         self.load(first, bytes)?;
@@ -173,7 +186,7 @@ impl Scratch {
     ///
     /// # Errors
     /// When the file cannot be read back.
-    pub fn read(&self, places: &[u32], mut visit: impl FnMut(&[u8])) -> io::Result<()> {
+    pub fn read(&self, places: &[u32], mut visit: impl FnMut(&[u8])) -> ScratchResult<()> {
         let mut bytes = Vec::new();
         for places in together(self.record, places) {
             let first = self.load_span(places, &mut bytes)?;
@@ -186,7 +199,7 @@ impl Scratch {
     ///
     /// # Errors
     /// When the file cannot be read back or written.
-    pub fn update(&mut self, places: &[u32], mut visit: impl FnMut(&mut [u8])) -> io::Result<()> {
+    pub fn update(&mut self, places: &[u32], mut visit: impl FnMut(&mut [u8])) -> ScratchResult<()> {
         let mut bytes = Vec::new();
         for places in together(self.record, places) {
             let first = self.load_span(places, &mut bytes)?;
@@ -200,7 +213,7 @@ impl Scratch {
     ///
     /// # Errors
     /// When the file cannot be read back.
-    pub fn read_as<T: Pod>(&self, places: &[u32]) -> io::Result<Vec<T>> {
+    pub fn read_as<T: Pod>(&self, places: &[u32]) -> ScratchResult<Vec<T>> {
         let mut values = Vec::with_capacity(places.len());
         self.read(places, |record| values.push(bytemuck::pod_read_unaligned(record)))?;
         Ok(values)
@@ -210,7 +223,7 @@ impl Scratch {
     ///
     /// # Errors
     /// When the file cannot be read back.
-    pub fn get<T: Pod>(&self, place: u32) -> io::Result<T> {
+    pub fn get<T: Pod>(&self, place: u32) -> ScratchResult<T> {
         let mut value = T::zeroed();
         let record = bytemuck::bytes_of_mut(&mut value);
         let buffered = place.checked_sub(self.buffered).map(|i| i as usize * self.record);
@@ -219,6 +232,11 @@ impl Scratch {
             None => self.load(self.at(place), record)?,
         }
         Ok(value)
+    }
+
+    fn failed(&self) -> impl FnOnce(io::Error) -> ScratchError + use<> {
+        let folder = self.folder.path().to_owned();
+        move |source| ScratchError { folder, source }
     }
 
     fn at(&self, place: u32) -> u64 {

@@ -1,54 +1,29 @@
 //! Every brick in the codec that serves the whole best.
 
-use std::io;
-
+use super::Allocation;
 use super::choices::AT_ONCE;
 use super::search::GridSearch;
 use super::size::at_size;
-use super::{AllocateError, Allocation};
+use super::target::{AdaptiveGrid, Target};
+use crate::cancel::CancelToken;
+use crate::error::Result;
 use crate::settings::{FRAME_MARGIN_DB, Quality};
-use crate::stages::dedup::SequenceTree;
-use crate::stages::encodings::Encodings;
-
-/// One grid to be allocated.
-pub struct AdaptiveGrid<'a> {
-    /// Its nodes and bricks.
-    pub tree: &'a mut SequenceTree,
-    /// What codecs make of its bricks.
-    pub encodings: Encodings,
-    /// What is asked of it, where no size is asked of all.
-    pub quality: Quality,
-    /// What its errors are measured against.
-    pub peak: f64,
-    /// A voxel's smallest side.
-    pub voxel_size: f64,
-}
-
-/// What a pack is asked for beside the quality of each grid.
-#[derive(Clone, Copy, Debug)]
-pub struct Target {
-    /// The most bytes of tree, masks and texels together.
-    pub size: Option<u64>,
-    /// The PSNR that no frame falls below; 6 dB below the whole's where none is given.
-    pub min_frame_psnr: Option<f64>,
-    /// Bytes of tree and masks with a record for every brick; only where a size is asked for.
-    pub fixed_bytes: u64,
-}
 
 /// Gives each brick of each grid its codec. `advance` hears of bricks that BC7 was tried on.
 ///
 /// # Errors
-/// [`AllocateError`].
+/// When bricks cannot be read, a scratch file fails, or the work is cancelled.
 pub fn adaptive(
     grids: Vec<AdaptiveGrid>,
     target: &Target,
+    cancel: &CancelToken,
     advance: &mut dyn FnMut(u64),
-) -> Result<Vec<Allocation>, AllocateError> {
+) -> Result<Vec<Allocation>> {
     let mut searches = Vec::new();
-    for mut grid in grids {
+    for grid in grids {
         let all: Vec<u32> = (0..grid.tree.pool.len()).collect();
-        grid.encodings.make(grid.tree, &all, &AT_ONCE, |_| ())?;
-        searches.push(GridSearch::new(grid)?);
+        grid.encoders.make(grid.tree, &all, &AT_ONCE, |_| ())?;
+        searches.push(GridSearch::new(grid, cancel.clone())?);
     }
     let picks = match target.size {
         Some(bytes) => at_size(&mut searches, bytes, target, advance)?,
@@ -64,8 +39,8 @@ pub fn adaptive(
                 }
                 other => unreachable!("{other} is a size, or was made one that suits the grid"),
             })
-            .collect::<io::Result<_>>()?,
+            .collect::<Result<_>>()?,
     };
     let each = searches.into_iter().zip(picks);
-    Ok(each.map(|(search, picks)| search.finish(&picks)).collect::<io::Result<_>>()?)
+    each.map(|(search, picks)| search.finish(&picks)).collect()
 }

@@ -10,7 +10,6 @@
 
 use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
-use std::io;
 use std::ops::Range;
 
 use bytemuck::{Pod, Zeroable};
@@ -19,14 +18,14 @@ use ndarray::Array2;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::cache::{Key, Stage, pods};
+use crate::cancel::CancelToken;
 use crate::codec::{BrickRange, SequenceRange, decode};
+use crate::error::Result;
+use crate::pods;
 use crate::profile;
 use crate::stages::dedup::SequenceTree;
-use crate::stages::encodings::{Batch, Cost, Encodings, KeptCodec, Tried};
-use crate::volume::{BRICK_VOXELS, Brick, Mask512};
-
-const STAGE: Stage = Stage { name: "share", version: 2, travels: true };
+use crate::stages::encoder_cache::{Batch, Cost, EncoderCache, KeptCodec, Tried};
+use crate::volume::{BRICK_VOXELS, Brick, Mask512, ScratchResult};
 
 /// Bricks to either side that a batch is compared with at least: in short frames those of a few.
 const LEAST_NEAR: usize = 128;
@@ -56,7 +55,7 @@ pub(super) struct TexelReference {
 /// A [`TexelReference`] by its referenced brick's place among the referenced bricks that were compared, and its range as a record has it.
 #[derive(Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
-struct Offer {
+pub struct Offer {
     referenced: u32,
     range: u32,
     error_l2: f64,
@@ -65,13 +64,35 @@ struct Offer {
 
 /// What was offered to the borrowers of a batch.
 #[derive(Default, Serialize, Deserialize)]
-struct Offers {
+pub struct Offers {
     /// How many to each.
     #[serde(with = "pods")]
     counts: Vec<u8>,
     /// One borrower's after another's, of each the closest first.
     #[serde(with = "pods")]
     all: Vec<Offer>,
+}
+
+/// Offers that earlier builds made. Whoever runs the stages puts it around a search; without one all are made.
+pub trait EarlierOffers: Sync {
+    /// For each of some comparisons what was offered, if it is known.
+    fn known(&self, comparisons: &[OfferInputs]) -> Vec<Option<Offers>>;
+    /// Keeps what was offered for later builds.
+    fn keep(&self, comparison: &OfferInputs, offers: &Offers);
+}
+
+/// What the offers of a comparison depend on.
+pub struct OfferInputs {
+    /// The batches that the referenced bricks are in.
+    pub around: Range<usize>,
+    /// The place among them of the one that the borrowers are in.
+    pub batch: usize,
+    /// The place of each borrower in its frame, and a hash of its active voxels.
+    pub borrowers: Vec<(u32, u64)>,
+    /// How many referenced bricks each of the batches has: places are told from each other by it.
+    pub counts: Vec<usize>,
+    /// The place of each referenced brick in its frame, and its codec.
+    pub referenced_bricks: Vec<(u32, KeptCodec)>,
 }
 
 /// A brick that could lend, with its texels as a GPU reads them, 0 to 1.
@@ -93,51 +114,53 @@ const BATCHES: usize = 32;
 /// Visits the bricks that may borrow, ascending and some at a time, each with the nearest of those that lend, the
 /// closest first.
 pub(super) fn texel_references(
-    encodings: &Encodings,
+    encoders: &EncoderCache,
     tree: &mut SequenceTree,
     borrows: impl Fn(u32) -> bool,
     lends: impl Fn(u32) -> Option<KeptCodec>,
-    mut visit: impl FnMut(&[u32], Vec<Vec<TexelReference>>) -> io::Result<()>,
-) -> io::Result<()> {
+    earlier: Option<&dyn EarlierOffers>,
+    cancel: &CancelToken,
+    mut visit: impl FnMut(&[u32], Vec<Vec<TexelReference>>) -> Result<()>,
+) -> Result<()> {
     let referenced_bricks = |ids: &Range<u32>| -> Vec<(u32, KeptCodec)> {
         ids.clone().filter_map(|id| Some((id, lends(id)?))).collect()
     };
     let mut near = Near::default();
-    let batches: Vec<usize> = (0..encodings.batches().len()).collect();
+    let batches: Vec<usize> = (0..encoders.batches().len()).collect();
     for window in batches.chunks(BATCHES) {
         let comparison = |&batch: &usize| {
-            let around = around(encodings.batches(), batch);
-            let batches = &encodings.batches()[around.clone()];
+            let around = around(encoders.batches(), batch);
+            let batches = &encoders.batches()[around.clone()];
             Comparison {
                 batch,
-                borrowers: encodings.batches()[batch].ids.clone().filter(|&id| borrows(id)).collect(),
+                borrowers: encoders.batches()[batch].ids.clone().filter(|&id| borrows(id)).collect(),
                 referenced_bricks: batches.iter().flat_map(|batch| referenced_bricks(&batch.ids)).collect(),
                 around,
             }
         };
         let comparisons: Vec<Comparison> = window.iter().map(comparison).collect();
-        let keys = comparisons.par_iter().map(|comparison| comparison.key(encodings, tree));
-        let keys: Vec<Option<Key>> = keys.collect::<io::Result<_>>()?;
-        if let Some(cache) = encodings.cache() {
-            cache.prefetch(keys.iter().copied().flatten());
+        let mut known: Vec<Option<Offers>> = comparisons.iter().map(|_| None).collect();
+        let mut inputs = Vec::new();
+        if let Some(earlier) = earlier {
+            let of = |comparison: &Comparison| comparison.inputs(encoders, tree);
+            inputs = comparisons.par_iter().map(of).collect::<ScratchResult<_>>()?;
+            let found = comparisons.iter().zip(earlier.known(&inputs));
+            known = found.map(|(comparison, offers)| offers.filter(|o| comparison.is_sound(o))).collect();
         }
-        let known =
-            comparisons.par_iter().zip(&keys).map(|(comparison, key)| comparison.known(encodings, *key));
-        let mut known: Vec<Option<Offers>> = known.collect();
         // Frames whose voxels are not there are read side by side.
         let unknown = comparisons.iter().zip(&known).filter(|(_, known)| known.is_none());
         let unknown: Vec<u32> = unknown.flat_map(|(comparison, _)| &comparison.borrowers).copied().collect();
         tree.fetch(&unknown)?;
         let mut next = 0;
         while next < comparisons.len() {
-            crate::interrupt::check()?;
+            cancel.check()?;
             if known[next].is_none() {
                 let unknown = known[next..].iter().take_while(|known| known.is_none()).count();
                 let group = together(&comparisons[next..next + unknown]);
-                near.move_to(encodings, tree, group, &referenced_bricks)?;
-                for (i, offers) in (next..).zip(nearest(encodings, tree, group, &near)?) {
-                    if let Some((cache, key)) = encodings.cache().zip(keys[i]) {
-                        cache.put(&key, &offers);
+                near.move_to(encoders, tree, group, &referenced_bricks)?;
+                for (i, offers) in (next..).zip(nearest(encoders, tree, group, &near)?) {
+                    if let Some(earlier) = earlier {
+                        earlier.keep(&inputs[i], &offers);
                     }
                     known[i] = Some(offers);
                 }
@@ -170,19 +193,16 @@ struct Comparison {
 }
 
 impl Comparison {
-    /// The offers that are in the cache.
-    fn known(&self, encodings: &Encodings, key: Option<Key>) -> Option<Offers> {
-        let is_sound = |offers: &Offers| {
-            offers.counts.len() == self.borrowers.len()
-                && offers.counts.iter().map(|count| usize::from(*count)).sum::<usize>() == offers.all.len()
-                && offers.all.iter().all(|offer| {
-                    let extent = BrickRange::from_word(offer.range).extent;
-                    (offer.referenced as usize) < self.referenced_bricks.len()
-                        && extent.is_finite()
-                        && extent > f16::ZERO
-                })
-        };
-        encodings.cache()?.get(&key?).filter(is_sound)
+    /// Whether offers can be its own.
+    fn is_sound(&self, offers: &Offers) -> bool {
+        offers.counts.len() == self.borrowers.len()
+            && offers.counts.iter().map(|count| usize::from(*count)).sum::<usize>() == offers.all.len()
+            && offers.all.iter().all(|offer| {
+                let extent = BrickRange::from_word(offer.range).extent;
+                (offer.referenced as usize) < self.referenced_bricks.len()
+                    && extent.is_finite()
+                    && extent > f16::ZERO
+            })
     }
 
     /// What is offered to each borrower.
@@ -197,24 +217,18 @@ impl Comparison {
         offers.counts.iter().map(|&count| all.by_ref().take(count.into()).collect()).collect()
     }
 
-    /// What the offers depend on; `None` where nothing is cached.
-    fn key(&self, encodings: &Encodings, tree: &SequenceTree) -> io::Result<Option<Key>> {
-        let batches = &encodings.batches()[self.around.clone()];
-        let keys: Option<Vec<[u8; 32]>> = batches.iter().map(|b| b.base.map(|key| *key.digest())).collect();
-        let Some(keys) = keys else { return Ok(None) };
+    fn inputs(&self, encoders: &EncoderCache, tree: &SequenceTree) -> ScratchResult<OfferInputs> {
         let place = |id: u32| tree.pool.place(id);
         let actives = tree.pool.active_hashes(&self.borrowers)?;
-        let borrowers: Vec<(u32, u64)> =
-            self.borrowers.iter().zip(actives).map(|(&id, active)| (place(id), active)).collect();
-        // Places are told from each other by the batch that they are in.
-        let counts: Vec<usize> =
-            batches.iter().map(|batch| count(&self.referenced_bricks, &batch.ids)).collect();
-        let referenced_bricks: Vec<(u32, KeptCodec)> =
-            self.referenced_bricks.iter().map(|&(id, codec)| (place(id), codec)).collect();
-        Ok(Some(Key::new(
-            &STAGE,
-            &(keys, self.batch - self.around.start, borrowers, counts, referenced_bricks),
-        )))
+        let borrowers = self.borrowers.iter().zip(actives).map(|(&id, active)| (place(id), active));
+        let batches = encoders.batches()[self.around.clone()].iter();
+        Ok(OfferInputs {
+            around: self.around.clone(),
+            batch: self.batch - self.around.start,
+            borrowers: borrowers.collect(),
+            counts: batches.map(|batch| count(&self.referenced_bricks, &batch.ids)).collect(),
+            referenced_bricks: self.referenced_bricks.iter().map(|&(id, codec)| (place(id), codec)).collect(),
+        })
     }
 }
 
@@ -250,17 +264,17 @@ impl Near {
     /// Decodes the referenced bricks around some batches that were not there for those before, and forgets others.
     fn move_to(
         &mut self,
-        encodings: &Encodings,
+        encoders: &EncoderCache,
         tree: &SequenceTree,
         comparisons: &[Comparison],
         referenced_bricks: &impl Fn(&Range<u32>) -> Vec<(u32, KeptCodec)>,
-    ) -> io::Result<()> {
+    ) -> Result<()> {
         let around = comparisons[0].around.start..comparisons[comparisons.len() - 1].around.end;
         self.batches.retain(|batch, _| around.contains(batch));
         for batch in around {
             if let Entry::Vacant(place) = self.batches.entry(batch) {
-                let referenced_bricks = referenced_bricks(&encodings.batches()[batch].ids);
-                place.insert(decoded(encodings, tree, &referenced_bricks)?);
+                let referenced_bricks = referenced_bricks(&encoders.batches()[batch].ids);
+                place.insert(decoded(encoders, tree, &referenced_bricks)?);
             }
         }
         Ok(())
@@ -273,17 +287,17 @@ impl Near {
 }
 
 fn decoded(
-    encodings: &Encodings,
+    encoders: &EncoderCache,
     tree: &SequenceTree,
     referenced_bricks: &[(u32, KeptCodec)],
-) -> io::Result<Vec<Lender>> {
+) -> Result<Vec<Lender>> {
     let mut places: [Vec<u32>; KeptCodec::ALL.len()] = Default::default();
     let mut tried = Vec::new();
     for &(id, codec) in referenced_bricks {
         places[codec as usize].push(id);
     }
     for codec in KeptCodec::ALL {
-        tried.push(encodings.texels(&places[codec as usize], codec)?);
+        tried.push(encoders.texels(&places[codec as usize], codec)?);
     }
     let referenced = |&(id, codec): &(u32, KeptCodec)| {
         let place = places[codec as usize].binary_search(&id).expect("every lender is of one of the codecs");
@@ -292,7 +306,7 @@ fn decoded(
         let (bytes, axis) = (&bytes[place * size..][..size], axes[place]);
         let texels = decode(codec, bytes, axis, &SequenceRange::default(), BrickRange::SEQUENCE);
         let (mean, energy) = moments(&texels);
-        let extent = encodings.range(tree, id).extent.to_f64() * f64::from(encodings.sequence.span);
+        let extent = encoders.range(tree, id).extent.to_f64() * f64::from(encoders.sequence.span);
         let error_l2 = costs[place].error_l2;
         // The part of its energy that is its own error is stretched with it.
         let trust = (1.0 - (error_l2 / extent).powi(2) / energy.max(f64::MIN_POSITIVE)).max(0.0).sqrt();
@@ -338,11 +352,11 @@ fn coarse(values: &[f32; BRICK_VOXELS], mean: f64, energy: f64, out: &mut [f32])
 
 /// For each comparison, and each of its borrowers, the closest of the referenced bricks.
 fn nearest(
-    encodings: &Encodings,
+    encoders: &EncoderCache,
     tree: &SequenceTree,
     comparisons: &[Comparison],
     near: &Near,
-) -> io::Result<Vec<Offers>> {
+) -> Result<Vec<Offers>> {
     let codebooks =
         comparisons.par_iter().map(|comparison| Codebook::new(near.referenced_bricks(&comparison.around)));
     let codebooks: Vec<Codebook> = codebooks.collect();
@@ -352,9 +366,9 @@ fn nearest(
     let parts: Vec<(&Comparison, &Codebook, &[u32])> = parts.collect();
     let offers = parts.into_par_iter().map(|(comparison, codebook, ids)| {
         let _span = profile::span("share");
-        codebook.nearest(encodings, ids, &tree.pool.read(ids)?, &comparison.referenced_bricks)
+        codebook.nearest(encoders, ids, &tree.pool.read(ids)?, &comparison.referenced_bricks)
     });
-    let mut parts = offers.collect::<io::Result<Vec<Offers>>>()?.into_iter();
+    let mut parts = offers.collect::<Result<Vec<Offers>>>()?.into_iter();
     let of = |comparison: &Comparison| {
         let mut offers = Offers::default();
         for part in parts.by_ref().take(comparison.borrowers.len().div_ceil(ROWS)) {
@@ -384,11 +398,11 @@ impl<'a> Codebook<'a> {
     /// For each of some bricks the closest referenced bricks; `places` are those of the referenced bricks.
     fn nearest(
         &self,
-        encodings: &Encodings,
+        encoders: &EncoderCache,
         ids: &[u32],
         bricks: &[Brick],
         places: &[(u32, KeptCodec)],
-    ) -> io::Result<Offers> {
+    ) -> Result<Offers> {
         let mut means = Vec::with_capacity(bricks.len());
         let mut shapes = Array2::<f32>::zeros((bricks.len(), COARSE));
         for (brick, mut row) in bricks.iter().zip(shapes.rows_mut()) {
@@ -400,10 +414,10 @@ impl<'a> Codebook<'a> {
         let similar = shapes.dot(&self.shapes.t());
         let mut all = Offers::default();
         for (((&id, brick), mean), similar) in ids.iter().zip(bricks).zip(means).zip(similar.rows()) {
-            let measure = encodings.measure(brick, &Mask512::ALL);
+            let measure = encoders.measure(brick, &Mask512::ALL);
             let offer = |j: usize| {
-                let range = borrow(&encodings.sequence, brick, mean, self.referenced_bricks.get(j)?)?;
-                let value = encodings.sequence.decoder(range);
+                let range = borrow(&encoders.sequence, brick, mean, self.referenced_bricks.get(j)?)?;
+                let value = encoders.sequence.decoder(range);
                 let decoded = self.referenced_bricks[j].texels.map(value);
                 let Cost { error_l2, active_error_l2, .. } = measure.of(&decoded, None);
                 Some(Offer { referenced: j as u32, range: range.to_word(), error_l2, active_error_l2 })

@@ -1,22 +1,21 @@
 //! What each candidate comes to for a brick, and what is exact of it.
 
 use std::collections::HashMap;
-use std::io;
 
 use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
 
 use super::borrow::TexelReference;
 use super::candidate::Candidate;
-use crate::stages::encodings::{Cost, Encodings, KeptCodec, Kind};
-use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder};
+use crate::stages::encoder_cache::{Cost, EncoderCache, KeptCodec, Kind};
+use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder, ScratchResult};
 
 /// An L3 record is three words.
 pub(super) const RECORD_BITS: u32 = 96;
 
 /// What the candidates come to that have a cost of their own, in squared peaks: half as wide as costs are, since all of a
 /// sequence's are looked at in every pass of a search. They serve to choose between candidates; what a chosen one costs is
-/// read from the encodings.
+/// read from the encoders.
 #[derive(Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
 pub(super) struct Choices {
@@ -146,7 +145,7 @@ impl Table {
     pub fn add(
         &mut self,
         bricks: impl Iterator<Item = (Choices, [Cost; Candidate::ALL.len()])>,
-    ) -> io::Result<()> {
+    ) -> ScratchResult<()> {
         for (mut choices, costs) in bricks {
             Candidate::ALL
                 .into_iter()
@@ -162,7 +161,7 @@ impl Table {
     ///
     /// # Errors
     /// When the scratch file fails.
-    pub fn weigh(&mut self, ids: &[u32], candidate: Candidate, costs: &[Cost]) -> io::Result<()> {
+    pub fn weigh(&mut self, ids: &[u32], candidate: Candidate, costs: &[Cost]) -> ScratchResult<()> {
         let mut costs = costs.iter();
         self.choices.update(ids, |record| {
             let mut choices: Choices = bytemuck::pod_read_unaligned(record);
@@ -180,7 +179,7 @@ impl Table {
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn read(&self, ids: &[u32]) -> io::Result<Vec<Choices>> {
+    pub fn read(&self, ids: &[u32]) -> ScratchResult<Vec<Choices>> {
         self.choices.read_as(ids)
     }
 
@@ -190,7 +189,7 @@ impl Table {
     }
 
     /// Looks at every brick, on all cores. Blocks come in order.
-    fn blocks<T: Send>(&self, look: impl Fn(&[u32], &[Choices]) -> T + Sync) -> io::Result<Vec<T>> {
+    fn blocks<T: Send>(&self, look: impl Fn(&[u32], &[Choices]) -> T + Sync) -> ScratchResult<Vec<T>> {
         let blocks = (0..self.bricks.div_ceil(BLOCK)).into_par_iter();
         let block = |block: u32| {
             let ids: Vec<u32> = (block * BLOCK..(block * BLOCK + BLOCK).min(self.bricks)).collect();
@@ -203,7 +202,7 @@ impl Table {
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn each<T: Send>(&self, of: impl Fn(u32, Weighed) -> T + Sync) -> io::Result<Vec<T>> {
+    pub fn each<T: Send>(&self, of: impl Fn(u32, Weighed) -> T + Sync) -> ScratchResult<Vec<T>> {
         let look = |ids: &[u32], choices: &[Choices]| -> Vec<T> {
             ids.iter().zip(choices).map(|(&id, choices)| of(id, self.weighed(id, choices))).collect()
         };
@@ -214,7 +213,7 @@ impl Table {
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn sum(&self, of: impl Fn(u32, Weighed) -> f64 + Sync) -> io::Result<f64> {
+    pub fn sum(&self, of: impl Fn(u32, Weighed) -> f64 + Sync) -> ScratchResult<f64> {
         let look = |ids: &[u32], choices: &[Choices]| -> f64 {
             ids.iter().zip(choices).map(|(&id, choices)| of(id, self.weighed(id, choices))).sum()
         };
@@ -254,12 +253,12 @@ impl Table {
 /// What candidates do to some bricks, by [`Candidate::ALL`], and [`Candidate::Constant`]'s values. What was not tried costs nothing,
 /// and texel references are not among it.
 pub(super) fn costs(
-    encodings: &Encodings,
+    encoders: &EncoderCache,
     ids: &[u32],
     bc7_is_tried: &[bool],
-) -> io::Result<Vec<([Cost; Candidate::ALL.len()], f32)>> {
+) -> ScratchResult<Vec<([Cost; Candidate::ALL.len()], f32)>> {
     let mut all = Vec::with_capacity(ids.len());
-    for plain in encodings.plain(ids)? {
+    for plain in encoders.plain(ids)? {
         let mut costs = [Cost::NONE; Candidate::ALL.len()];
         costs[Candidate::Empty as usize] = plain.empty;
         costs[Candidate::Constant as usize] = plain.constant;
@@ -268,13 +267,13 @@ pub(super) fn costs(
         all.push((costs, plain.value));
     }
     for (candidate, codec) in [(Candidate::Bc4, KeptCodec::Bc4), (Candidate::Unorm8, KeptCodec::Unorm8)] {
-        for ((costs, _), cost) in all.iter_mut().zip(encodings.costs(ids, codec)?) {
+        for ((costs, _), cost) in all.iter_mut().zip(encoders.costs(ids, codec)?) {
             costs[candidate as usize] = cost;
         }
     }
     let tried = || (0..ids.len()).filter(|&i| bc7_is_tried[ids[i] as usize]);
     let bc7: Vec<u32> = tried().map(|i| ids[i]).collect();
-    for (i, cost) in tried().zip(encodings.costs(&bc7, KeptCodec::Bc7)?) {
+    for (i, cost) in tried().zip(encoders.costs(&bc7, KeptCodec::Bc7)?) {
         all[i].0[Candidate::Bc7 as usize] = cost;
     }
     Ok(all)

@@ -5,26 +5,28 @@ use ndarray::ArrayView2;
 use rayon::prelude::*;
 
 use super::kmeans::{KMeansSettings, kmeans};
-use super::{AllocateError, Allocation, Coding, Shape, windows};
+use super::{Allocation, Coding, Shape, windows};
 use crate::codec::{BrickRange, Codec, SequenceRange, Texels, decode, encode};
+use crate::error::{Error, Result};
 use crate::settings::{Clustering, RangeMode};
 use crate::stages::dedup::{SequenceTree, texel_mask};
-use crate::stages::encodings::Encodings;
+use crate::stages::encoder_cache::EncoderCache;
 use crate::volume::{BRICK_VOXELS, BRICKS_IN_FLIGHT, Brick, Mask512, ValueRange};
 
-/// Gives every brick of `tree` one codec, and clusters those of little variance. The voxels of those are in memory
+/// Gives every brick of the tree of `grid` one codec, and clusters those of little variance. The voxels of those are in memory
 /// together: 2 KB a brick.
 ///
 /// # Errors
-/// [`AllocateError`].
+/// When bricks cannot be read, or a centroid has a value that the codec cannot hold.
 pub fn clustered(
+    grid: &str,
     tree: &mut SequenceTree,
-    encodings: Encodings,
+    encoders: &EncoderCache,
     codec: Codec,
     mode: RangeMode,
     clustering: &Clustering,
-) -> Result<Allocation, AllocateError> {
-    let mut allocation = Allocation::new(&tree.scratch, encodings);
+) -> Result<Allocation> {
+    let mut allocation = Allocation::new(&tree.scratch, encoders);
     let sequence = allocation.sequence;
     let (mut ids, mut points) = (Vec::new(), Vec::new());
     for window in windows(tree.pool.len(), BRICKS_IN_FLIGHT) {
@@ -49,7 +51,8 @@ pub fn clustered(
 
     let centroids: Vec<Texels> =
         found.centroids.rows().into_iter().map(|row| texels(&sequence, mode, &row.to_vec())).collect();
-    let encoded = encode(codec, &sequence, &centroids)?;
+    let encoded = encode(codec, &sequence, &centroids)
+        .map_err(|source| Error::OutOfRange { grid: grid.to_owned(), source })?;
     let size = codec.layout().brick_bytes();
     allocation.shapes = encoded
         .bytes
@@ -75,7 +78,7 @@ pub fn clustered(
     let mut members = ids.iter().zip(&found.members).peekable();
     for id in 0..tree.pool.len() {
         match members.next_if(|(member, _)| **member == id) {
-            Some((_, &shape)) => allocation.push(Coding::Shared(shape), Some(ranges[shape as usize])),
+            Some((_, &shape)) => allocation.push(Coding::Clustered(shape), Some(ranges[shape as usize])),
             None => allocation.push(Coding::Own(codec), None),
         }
     }

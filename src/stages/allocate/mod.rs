@@ -11,18 +11,20 @@ mod cluster;
 pub mod kmeans;
 mod search;
 mod size;
-
-use std::io;
+mod target;
 
 use half::f16;
 
 use super::dedup::SequenceTree;
-use super::encodings::Encodings;
-use crate::codec::{BrickRange, Codec, OutOfRange, SequenceRange};
-use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder, SortedMap, ValueRange};
+use super::encoder_cache::{EncoderCache, own_range};
+use crate::codec::{BrickRange, Codec, SequenceRange};
+use crate::settings::RangeMode;
+use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder, ScratchResult, SortedMap, ValueRange};
 
-pub use adaptive::{AdaptiveGrid, Target, adaptive};
+pub use adaptive::adaptive;
+pub use borrow::{EarlierOffers, Offer, OfferInputs, Offers};
 pub use cluster::clustered;
+pub use target::{AdaptiveGrid, Target};
 
 /// How one grid's bricks are coded.
 pub struct Allocation {
@@ -37,11 +39,11 @@ pub struct Allocation {
     /// Under which range a brick reads texels that were made for another.
     borrowed: SortedMap<BrickRange>,
     /// The root of the squared error of each brick over the voxels that its texels give.
-    pub error_l2s: Norms,
+    pub error_l2s: BrickErrors,
     /// The squared error of each frame's empty bricks.
     pub empty_squares: Vec<f64>,
-    /// What codecs make of them.
-    pub encodings: Encodings,
+    /// What texels of their own are fractions of.
+    mode: RangeMode,
 }
 
 /// What gives a brick its values.
@@ -55,8 +57,8 @@ pub enum Coding {
     Own(Codec),
     /// The texels of this brick, which are its own.
     Borrowed(u32),
-    /// The texels of this place of [`Allocation::shapes`].
-    Shared(u32),
+    /// The texels of this place of [`Allocation::shapes`], which stand for a cluster of bricks.
+    Clustered(u32),
 }
 
 /// A [`Coding`] in a byte.
@@ -66,13 +68,13 @@ enum Kind {
     Constant,
     Own(Codec),
     Borrowed,
-    Shared,
+    Clustered,
 }
 
 /// Errors of bricks, 8 bytes each, of which a sequence has too many to keep in memory.
-pub struct Norms {
+pub struct BrickErrors {
     error_l2s: Scratch,
-    /// Whether there is one for each brick before its texels are made. Else quantising adds those that lack.
+    /// Whether there is one for each brick before its texels are made.
     pub are_known: bool,
 }
 
@@ -86,20 +88,9 @@ pub struct Shape {
     pub axis: u8,
 }
 
-/// The pack cannot be allocated.
-#[derive(Debug, thiserror::Error)]
-pub enum AllocateError {
-    /// Reading bricks back failed.
-    #[error(transparent)]
-    Io(#[from] io::Error),
-    /// A value does not fit the codec.
-    #[error(transparent)]
-    OutOfRange(#[from] OutOfRange),
-}
-
-impl Norms {
+impl BrickErrors {
     /// None yet.
-    fn new(scratch: &ScratchFolder) -> Self {
+    pub(super) fn new(scratch: &ScratchFolder) -> Self {
         Self { error_l2s: Scratch::new(scratch, size_of::<f64>(), SCRATCH_SMALL), are_known: false }
     }
 
@@ -107,7 +98,7 @@ impl Norms {
     ///
     /// # Errors
     /// When the scratch file cannot be written.
-    pub fn put(&mut self, first: u32, error_l2s: &[f64]) -> io::Result<()> {
+    pub fn put(&mut self, first: u32, error_l2s: &[f64]) -> ScratchResult<()> {
         self.error_l2s.put(first, bytemuck::cast_slice(error_l2s))
     }
 
@@ -115,7 +106,7 @@ impl Norms {
     ///
     /// # Errors
     /// When the scratch file cannot be written.
-    pub fn flush(&mut self) -> io::Result<()> {
+    pub fn flush(&mut self) -> ScratchResult<()> {
         self.error_l2s.flush()
     }
 
@@ -123,22 +114,22 @@ impl Norms {
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn read(&self, ids: &[u32]) -> io::Result<Vec<f64>> {
+    pub fn read(&self, ids: &[u32]) -> ScratchResult<Vec<f64>> {
         self.error_l2s.read_as(ids)
     }
 }
 
 impl Allocation {
-    fn new(scratch: &ScratchFolder, encodings: Encodings) -> Self {
+    fn new(scratch: &ScratchFolder, encoders: &EncoderCache) -> Self {
         Self {
-            sequence: encodings.sequence,
+            sequence: encoders.sequence,
             kinds: Vec::new(),
             words: SortedMap::default(),
             shapes: Vec::new(),
             borrowed: SortedMap::default(),
-            error_l2s: Norms::new(scratch),
+            error_l2s: BrickErrors::new(scratch),
             empty_squares: Vec::new(),
-            encodings,
+            mode: encoders.terms().range,
         }
     }
 
@@ -150,11 +141,21 @@ impl Allocation {
             Coding::Constant(value) => (Kind::Constant, Some(value.to_bits())),
             Coding::Own(codec) => (Kind::Own(codec), None),
             Coding::Borrowed(referenced) => (Kind::Borrowed, Some(referenced)),
-            Coding::Shared(shape) => (Kind::Shared, Some(shape)),
+            Coding::Clustered(shape) => (Kind::Clustered, Some(shape)),
         };
         self.kinds.push(kind);
         word.into_iter().for_each(|word| self.words.push(id, word));
         borrowed.into_iter().for_each(|range| self.borrowed.push(id, range));
+    }
+
+    /// Whether a brick was left out: what was there is background.
+    pub fn is_empty_brick(&self, brick: u32) -> bool {
+        matches!(self.kinds[brick as usize], Kind::Empty)
+    }
+
+    /// Whether any was.
+    pub fn has_empty_bricks(&self) -> bool {
+        self.kinds.iter().any(|kind| matches!(kind, Kind::Empty))
     }
 
     /// How many bricks there are.
@@ -175,7 +176,7 @@ impl Allocation {
             Kind::Constant => Coding::Constant(f32::from_bits(word())),
             Kind::Own(codec) => Coding::Own(codec),
             Kind::Borrowed => Coding::Borrowed(word()),
-            Kind::Shared => Coding::Shared(word()),
+            Kind::Clustered => Coding::Clustered(word()),
         }
     }
 
@@ -185,7 +186,7 @@ impl Allocation {
             Coding::Empty | Coding::Constant(_) => Codec::Constant,
             Coding::Own(codec) => codec,
             Coding::Borrowed(referenced) => self.codec(referenced),
-            Coding::Shared(shape) => self.shapes[shape as usize].codec,
+            Coding::Clustered(shape) => self.shapes[shape as usize].codec,
         }
     }
 
@@ -199,7 +200,10 @@ impl Allocation {
                 let [min, max] = [min, max].map(|v| f16::from_f32(v).to_f32());
                 self.sequence.fit(min, max)
             }
-            _ => self.borrowed.get(brick).unwrap_or_else(|| self.encodings.range(tree, brick)),
+            _ => self
+                .borrowed
+                .get(brick)
+                .unwrap_or_else(|| own_range(&self.sequence, self.mode, tree.brick_ranges[brick])),
         }
     }
 }
@@ -210,8 +214,8 @@ fn windows(bricks: u32, size: u32) -> impl Iterator<Item = Vec<u32>> {
 }
 
 /// Gives every brick of `tree` one codec.
-pub fn uniform(tree: &SequenceTree, encodings: Encodings, codec: Codec) -> Allocation {
-    let mut allocation = Allocation::new(&tree.scratch, encodings);
+pub fn uniform(tree: &SequenceTree, encoders: &EncoderCache, codec: Codec) -> Allocation {
+    let mut allocation = Allocation::new(&tree.scratch, encoders);
     (0..tree.pool.len()).for_each(|_| allocation.push(Coding::Own(codec), None));
     allocation
 }

@@ -6,18 +6,19 @@
 //! counts as one that it serves without error: whoever prefers something else even then never needs it, and whoever
 //! chooses it is tried and the search goes on with what was found.
 
-use std::io;
 use std::sync::LazyLock;
 
-use super::adaptive::AdaptiveGrid;
 use super::borrow::{TexelReference, texel_references};
 use super::candidate::Candidate;
 use super::choices::{BLOCK, Choices, Table, Weighed, costs};
-use super::{Allocation, Coding, windows};
+use super::target::AdaptiveGrid;
+use super::{Allocation, Coding, EarlierOffers, windows};
+use crate::cancel::CancelToken;
+use crate::error::Result;
 use crate::profile;
 use crate::settings::Quality;
 use crate::stages::dedup::{FrameTree, Payload, SequenceTree};
-use crate::stages::encodings::{Cost, Encodings, KeptCodec, Kind};
+use crate::stages::encoder_cache::{Cost, EncoderCache, KeptCodec, Kind};
 
 /// A step is 1.1 % of λ, under 0.05 dB of PSNR.
 const STEPS_PER_OCTAVE: u32 = 64;
@@ -47,7 +48,9 @@ const ROUNDING: f64 = 1.0 - 1e-6;
 /// One grid and what is known of it.
 pub(super) struct GridSearch<'a> {
     pub(super) tree: &'a mut SequenceTree,
-    encodings: Encodings,
+    encoders: &'a mut EncoderCache,
+    earlier: Option<&'a dyn EarlierOffers>,
+    cancel: CancelToken,
     pub(super) voxel_size: f64,
     pub(super) quality: Quality,
     /// How far the nearest float is from a value of the source at most.
@@ -66,7 +69,7 @@ pub(super) struct GridSearch<'a> {
 }
 
 impl<'a> GridSearch<'a> {
-    pub(super) fn new(grid: AdaptiveGrid<'a>) -> io::Result<Self> {
+    pub(super) fn new(grid: AdaptiveGrid<'a>, cancel: CancelToken) -> Result<Self> {
         let tree = grid.tree;
         let mut uses = vec![0; tree.brick_ranges.len()];
         for frame in &tree.frames {
@@ -88,11 +91,13 @@ impl<'a> GridSearch<'a> {
             source_rounding: tree.frames.iter().map(|frame| frame.stats.rounding).fold(0.0, f64::max),
             may_vanish: false,
             table: Table::new(&tree.scratch, grid.peak),
-            encodings: grid.encodings,
+            encoders: grid.encoders,
+            earlier: grid.earlier,
+            cancel,
             tree,
         };
         for ids in windows(uses.len() as u32, BLOCK) {
-            let costs = costs(&search.encodings, &ids, &search.bc7_is_tried)?;
+            let costs = costs(search.encoders, &ids, &search.bc7_is_tried)?;
             let choices = |&id: &u32| Choices::new(uses[id as usize], records[id as usize]);
             search.may_vanish |=
                 costs.iter().any(|(costs, _)| costs[Candidate::Empty as usize].error_l2 > 0.0);
@@ -135,18 +140,20 @@ impl<'a> GridSearch<'a> {
         weighed.best(lambda(step))
     }
 
-    pub(super) fn picks(&self, step: u32) -> io::Result<Vec<Candidate>> {
-        self.table.each(|id, weighed| self.pick(id, weighed, step))
+    pub(super) fn picks(&self, step: u32) -> Result<Vec<Candidate>> {
+        Ok(self.table.each(|id, weighed| self.pick(id, weighed, step))?)
     }
 
     /// The squared error of all frames over active voxels.
-    pub(super) fn squares(&self, picks: &[Candidate]) -> io::Result<f64> {
-        self.table.sum(|id, weighed| weighed.uses() * weighed.active_squares(picks[id as usize]))
+    pub(super) fn squares(&self, picks: &[Candidate]) -> Result<f64> {
+        Ok(self.table.sum(|id, weighed| weighed.uses() * weighed.active_squares(picks[id as usize]))?)
     }
 
     /// The same for what is picked at a step.
-    fn squares_at(&self, step: u32) -> io::Result<f64> {
-        self.table.sum(|id, weighed| weighed.uses() * weighed.active_squares(self.pick(id, weighed, step)))
+    fn squares_at(&self, step: u32) -> Result<f64> {
+        let squares =
+            |id, weighed: Weighed| weighed.uses() * weighed.active_squares(self.pick(id, weighed, step));
+        Ok(self.table.sum(squares)?)
     }
 
     /// Tries what was picked without having been tried. Whether there was any.
@@ -154,13 +161,13 @@ impl<'a> GridSearch<'a> {
         &mut self,
         picks: impl Iterator<Item = (u32, Candidate)>,
         advance: &mut dyn FnMut(u64),
-    ) -> io::Result<bool> {
+    ) -> Result<bool> {
         let unknown =
             picks.filter(|&(id, candidate)| candidate == Candidate::Bc7 && !self.bc7_is_tried[id as usize]);
         let unknown: Vec<u32> = unknown.map(|(id, _)| id).collect();
-        self.encodings.make(self.tree, &unknown, &[Kind::Texels(KeptCodec::Bc7)], advance)?;
+        self.encoders.make(self.tree, &unknown, &[Kind::Texels(KeptCodec::Bc7)], advance)?;
         for ids in unknown.chunks(BLOCK as usize) {
-            self.table.weigh(ids, Candidate::Bc7, &self.encodings.costs(ids, KeptCodec::Bc7)?)?;
+            self.table.weigh(ids, Candidate::Bc7, &self.encoders.costs(ids, KeptCodec::Bc7)?)?;
             ids.iter().for_each(|&id| self.bc7_is_tried[id as usize] = true);
         }
         Ok(!unknown.is_empty())
@@ -171,10 +178,10 @@ impl<'a> GridSearch<'a> {
         psnr: f64,
         floor: f64,
         advance: &mut dyn FnMut(u64),
-    ) -> io::Result<Vec<Candidate>> {
-        let (step, alone) = self.at_psnr_with_loans(psnr, floor, None, advance)?;
+    ) -> Result<Vec<Candidate>> {
+        let (step, alone) = self.at_psnr_with_references(psnr, floor, None, advance)?;
         self.find_references(&alone, step, advance)?;
-        let (_, together) = self.at_psnr_with_loans(psnr, floor, Some(step), advance)?;
+        let (_, together) = self.at_psnr_with_references(psnr, floor, Some(step), advance)?;
         let bits = |picks: &[Candidate]| self.table.sum(|id, weighed| weighed.bits(picks[id as usize]));
         if bits(&together)? < bits(&alone)? {
             return Ok(together);
@@ -183,13 +190,13 @@ impl<'a> GridSearch<'a> {
         Ok(alone)
     }
 
-    fn at_psnr_with_loans(
+    fn at_psnr_with_references(
         &mut self,
         psnr: f64,
         floor: f64,
         mut near: Option<u32>,
         advance: &mut dyn FnMut(u64),
-    ) -> io::Result<(u32, Vec<Candidate>)> {
+    ) -> Result<(u32, Vec<Candidate>)> {
         let allowed = self.allowance(self.active_voxels, psnr);
         loop {
             let span = profile::span("search");
@@ -225,7 +232,7 @@ impl<'a> GridSearch<'a> {
 
     /// The last brick that was made finer may have been a large one: where what it left over suffices for others to be
     /// coarser, they are, least loss for a bit first.
-    fn spend_slack(&self, picks: &mut [Candidate], allowed: f64, step: u32) -> io::Result<()> {
+    fn spend_slack(&self, picks: &mut [Candidate], allowed: f64, step: u32) -> Result<()> {
         let coarser = self.picks(step.saturating_sub(SLACK_STEPS))?;
         let (before, mut squares) = (picks.to_vec(), self.squares(picks)?);
         for Switch { brick, squares: [coarse, fine], .. } in
@@ -250,7 +257,7 @@ impl<'a> GridSearch<'a> {
         picks: &[Candidate],
         step: u32,
         advance: &mut dyn FnMut(u64),
-    ) -> io::Result<()> {
+    ) -> Result<()> {
         // Who is compared with whom does not change with every little more or less of λ: an edited frame leaves what
         // was found for the frames far from it as it is.
         let near = ((step + LENDING_STEPS / 2) / LENDING_STEPS * LENDING_STEPS).min(LAST_STEP);
@@ -259,7 +266,7 @@ impl<'a> GridSearch<'a> {
             compared = self.picks(near)?;
         }
         // Who may borrow, and of those who has texels that others can use.
-        let whole: Vec<bool> = (0..picks.len() as u32).map(|id| self.encodings.is_whole(id)).collect();
+        let whole: Vec<bool> = (0..picks.len() as u32).map(|id| self.encoders.is_whole(id)).collect();
         let borrows = |id: u32| whole[id as usize] && compared[id as usize] != Candidate::Empty;
         let lends = |id: u32| borrows(id).then(|| KeptCodec::of(compared[id as usize].codec())).flatten();
         let (table, least_step) = (&self.table, &self.least_step);
@@ -271,19 +278,29 @@ impl<'a> GridSearch<'a> {
         };
         // A fifth of the bricks has an offer worth taking.
         let mut order: Vec<(f64, u32, TexelReference)> = Vec::new();
-        texel_references(&self.encodings, self.tree, borrows, lends, |ids, texel_references| {
-            for ((&id, choices), texel_references) in ids.iter().zip(&table.read(ids)?).zip(texel_references)
-            {
-                let as_compared = |reference: &TexelReference| {
-                    picks[reference.referenced as usize] == compared[reference.referenced as usize]
-                };
-                let weighed = table.weighed(id, choices);
-                let offers = texel_references.into_iter().filter(as_compared);
-                let offers = offers.map(|reference| (gain(id, weighed, &reference), id, reference));
-                order.extend(offers.filter(|(gain, ..)| *gain > 0.0));
-            }
-            Ok(())
-        })?;
+        let (earlier, cancel) = (self.earlier, &self.cancel);
+        texel_references(
+            self.encoders,
+            self.tree,
+            borrows,
+            lends,
+            earlier,
+            cancel,
+            |ids, texel_references| {
+                for ((&id, choices), texel_references) in
+                    ids.iter().zip(&table.read(ids)?).zip(texel_references)
+                {
+                    let as_compared = |reference: &TexelReference| {
+                        picks[reference.referenced as usize] == compared[reference.referenced as usize]
+                    };
+                    let weighed = table.weighed(id, choices);
+                    let offers = texel_references.into_iter().filter(as_compared);
+                    let offers = offers.map(|reference| (gain(id, weighed, &reference), id, reference));
+                    order.extend(offers.filter(|(gain, ..)| *gain > 0.0));
+                }
+                Ok(())
+            },
+        )?;
         order.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
         for (_, id, reference) in order {
             let (referenced, table) = (reference.referenced, &mut self.table);
@@ -303,13 +320,13 @@ impl<'a> GridSearch<'a> {
         self.lends.fill(None);
     }
 
-    pub(super) fn within(&mut self, bound: f64, advance: &mut dyn FnMut(u64)) -> io::Result<Vec<Candidate>> {
+    pub(super) fn within(&mut self, bound: f64, advance: &mut dyn FnMut(u64)) -> Result<Vec<Candidate>> {
         let bound = (bound - self.source_rounding).max(0.0);
         let fits = |cost: &Cost| cost.error_l2.is_finite() && f64::from(cost.max) <= bound;
         loop {
             let mut picks = Vec::with_capacity(self.table.len() as usize);
             for ids in windows(self.table.len(), BLOCK) {
-                let costs = costs(&self.encodings, &ids, &self.bc7_is_tried)?;
+                let costs = costs(self.encoders, &ids, &self.bc7_is_tried)?;
                 picks.extend(costs.iter().map(|(costs, _)| {
                     Candidate::ALL
                         .into_iter()
@@ -324,12 +341,12 @@ impl<'a> GridSearch<'a> {
     }
 
     /// The PSNR of all frames together.
-    pub(super) fn whole(&self, picks: &[Candidate]) -> io::Result<f64> {
+    pub(super) fn whole(&self, picks: &[Candidate]) -> Result<f64> {
         Ok(Self::psnr(self.active_voxels, self.squares(picks)?))
     }
 
     /// The squared error of one frame over active voxels.
-    fn frame_squares(&self, frame: &FrameTree, picks: &[Candidate]) -> io::Result<f64> {
+    fn frame_squares(&self, frame: &FrameTree, picks: &[Candidate]) -> Result<f64> {
         let bricks: Vec<u32> = self.tree.frame_bricks(frame).collect();
         let choices = self.table.read(&bricks)?;
         let square = |(&id, choices)| self.table.weighed(id, choices).active_squares(picks[id as usize]);
@@ -337,7 +354,7 @@ impl<'a> GridSearch<'a> {
     }
 
     /// The PSNR of the worst frame.
-    pub(super) fn worst_frame(&self, picks: &[Candidate]) -> io::Result<f64> {
+    pub(super) fn worst_frame(&self, picks: &[Candidate]) -> Result<f64> {
         let mut worst = f64::INFINITY;
         for frame in &self.tree.frames {
             let db = Self::psnr(frame.stats.active_leaf_voxels, self.frame_squares(frame, picks)?);
@@ -357,7 +374,7 @@ impl<'a> GridSearch<'a> {
         floor: f64,
         current: u32,
         advance: &mut dyn FnMut(u64),
-    ) -> io::Result<bool> {
+    ) -> Result<bool> {
         // All are judged before texel references are called in for the sake of some.
         let mut low: Vec<(usize, f64)> = Vec::new();
         for (f, frame) in self.tree.frames.iter().enumerate() {
@@ -373,7 +390,7 @@ impl<'a> GridSearch<'a> {
             let mut unique = bricks.clone();
             unique.sort_unstable();
             unique.dedup();
-            self.call_in_loans(&unique);
+            self.call_in_references(&unique);
             let step = loop {
                 let (choices, table) = (self.table.read(&bricks)?, &self.table);
                 let weighed =
@@ -408,7 +425,7 @@ impl<'a> GridSearch<'a> {
     }
 
     /// Ends every texel reference that some bricks, ascending, are part of: they are to become finer, and their texels others.
-    fn call_in_loans(&mut self, bricks: &[u32]) {
+    fn call_in_references(&mut self, bricks: &[u32]) {
         for &id in bricks {
             self.lends[id as usize] = None;
         }
@@ -418,13 +435,13 @@ impl<'a> GridSearch<'a> {
         });
     }
 
-    pub(super) fn finish(self, picks: &[Candidate]) -> io::Result<Allocation> {
-        let Self { tree, encodings, bc7_is_tried, table, .. } = self;
+    pub(super) fn finish(self, picks: &[Candidate]) -> Result<Allocation> {
+        let Self { tree, encoders, bc7_is_tried, table, .. } = self;
         let texel_references = table.into_references();
-        let mut allocation = Allocation::new(&tree.scratch, encodings);
+        let mut allocation = Allocation::new(&tree.scratch, encoders);
         for ids in windows(picks.len() as u32, BLOCK) {
             let mut error_l2s = Vec::with_capacity(ids.len());
-            for (&id, (costs, value)) in ids.iter().zip(costs(&allocation.encodings, &ids, &bc7_is_tried)?) {
+            for (&id, (costs, value)) in ids.iter().zip(costs(encoders, &ids, &bc7_is_tried)?) {
                 let candidate = picks[id as usize];
                 let (coding, range, error_l2) = match candidate {
                     Candidate::Borrowed => {
@@ -450,17 +467,13 @@ impl<'a> GridSearch<'a> {
             let squares = allocation.error_l2s.read(&empty)?.into_iter().map(|error_l2| error_l2.powi(2));
             allocation.empty_squares.push(squares.sum());
         }
-        tree.prune(is_empty)?;
         Ok(allocation)
     }
 }
 
 /// The first step, of 0 to [`LAST_STEP`], that meets what every finer one meets too; the last if none does. Near a step
 /// that is known to be close by it is found in fewer looks.
-pub(super) fn first_step(
-    near: Option<u32>,
-    mut meets: impl FnMut(u32) -> io::Result<bool>,
-) -> io::Result<u32> {
+pub(super) fn first_step(near: Option<u32>, mut meets: impl FnMut(u32) -> Result<bool>) -> Result<u32> {
     let (mut low, mut high) = (0, LAST_STEP);
     if let Some(near) = near {
         let (mut at, mut stride) = (near, 1);
@@ -511,7 +524,7 @@ pub(super) fn switches(
     search: &GridSearch,
     coarse: &[Candidate],
     fine: &[Candidate],
-) -> io::Result<Vec<Switch>> {
+) -> Result<Vec<Switch>> {
     let differ: Vec<u32> =
         (0..).zip(coarse.iter().zip(fine)).filter(|(_, (a, b))| a != b).map(|(id, _)| id).collect();
     let mut switches = Vec::with_capacity(differ.len());

@@ -1,16 +1,15 @@
 //! The best choice that fits a size, with one λ for all grids of a pack.
 
-use std::io;
-
-use super::adaptive::Target;
 use super::candidate::Candidate;
 use super::choices::RECORD_BITS;
 use super::search::{GridSearch, Switch, first_step, switches};
+use super::target::Target;
 use crate::codec::Codec;
+use crate::error::Result;
+use crate::pack::plan;
 use crate::pack::tree::NODE_WORDS;
 use crate::settings::FRAME_MARGIN_DB;
 use crate::stages::dedup::Payload;
-use crate::stages::relayout;
 
 /// The finest choice that takes at most `limit` bytes, with one λ for all grids; the coarsest if none does.
 pub(super) fn at_size(
@@ -18,14 +17,14 @@ pub(super) fn at_size(
     limit: u64,
     target: &Target,
     advance: &mut dyn FnMut(u64),
-) -> io::Result<Vec<Vec<Candidate>>> {
+) -> Result<Vec<Vec<Candidate>>> {
     let fixed = target.fixed_bytes;
     let floors = match target.min_frame_psnr {
         Some(floor) => vec![floor; searches.len()],
         None => floors_at_size(searches, limit, fixed, advance)?,
     };
     let (step, alone) = at_size_above(searches, limit, fixed, &floors, advance)?;
-    let squares = |searches: &[GridSearch], picks: &[Vec<Candidate>]| -> io::Result<f64> {
+    let squares = |searches: &[GridSearch], picks: &[Vec<Candidate>]| -> Result<f64> {
         searches.iter().zip(picks).map(|(s, picks)| s.squares(picks)).sum()
     };
     for (search, picks) in searches.iter_mut().zip(&alone) {
@@ -52,11 +51,11 @@ fn floors_at_size(
     limit: u64,
     fixed: u64,
     advance: &mut dyn FnMut(u64),
-) -> io::Result<Vec<f64>> {
+) -> Result<Vec<f64>> {
     let none = vec![f64::NEG_INFINITY; searches.len()];
     let (_, free) = at_size_above(searches, limit, fixed, &none, advance)?;
     let end = |(s, p): (&GridSearch, &Vec<Candidate>)| Ok((s.worst_frame(p)?, s.whole(p)? - FRAME_MARGIN_DB));
-    let ends = |searches: &[GridSearch], picks: &[Vec<Candidate>]| -> io::Result<Vec<(f64, f64)>> {
+    let ends = |searches: &[GridSearch], picks: &[Vec<Candidate>]| -> Result<Vec<(f64, f64)>> {
         searches.iter().zip(picks).map(end).collect()
     };
     let free = ends(searches, &free)?;
@@ -92,8 +91,8 @@ fn at_size_above(
     fixed: u64,
     floors: &[f64],
     advance: &mut dyn FnMut(u64),
-) -> io::Result<(u32, Vec<Vec<Candidate>>)> {
-    let all = |searches: &[GridSearch], step| -> io::Result<Vec<Vec<Candidate>>> {
+) -> Result<(u32, Vec<Vec<Candidate>>)> {
+    let all = |searches: &[GridSearch], step| -> Result<Vec<Vec<Candidate>>> {
         searches.iter().map(|s| s.picks(step)).collect()
     };
     searches.iter_mut().for_each(|s| s.least_step.fill(0));
@@ -155,7 +154,7 @@ fn counts(picks: &[Vec<Candidate>]) -> [u32; Candidate::ALL.len()] {
 
 /// What the texture pages of that many bricks take.
 fn texel_bytes(counts: &[u32; Candidate::ALL.len()]) -> u64 {
-    let bytes = |candidate: Candidate| relayout::plan(candidate.codec(), counts[candidate as usize]).bytes();
+    let bytes = |candidate: Candidate| plan(candidate.codec(), counts[candidate as usize]).bytes();
     Candidate::ALL.into_iter().filter(|candidate| candidate.codec() != Codec::Constant).map(bytes).sum()
 }
 

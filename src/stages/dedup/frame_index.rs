@@ -4,7 +4,7 @@ use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::cache::pods;
+use crate::pods;
 use crate::stages::flatten::Flattened;
 use crate::volume::{
     Blocks, Brick, BrickPool, CELL_DIM, Cell, CellContent, Child, Constant, Coord, FlatFrame, FrameStats,

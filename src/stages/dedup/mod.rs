@@ -8,15 +8,14 @@ mod frame_index;
 mod nodes;
 
 use std::collections::{BTreeSet, HashMap};
-use std::io;
 use std::ops::Range;
 
 use rayon::prelude::*;
 
-use crate::error::Error;
+use crate::error::{Error, Result};
 use crate::volume::{
     Blocks, Brick, BrickPool, CellContent, Child, Constant, Coord, FrameStats, InactiveRule, Interner, List,
-    Mask512, ScratchFolder, SortedMap, ValueRange, bits,
+    Mask512, ScratchError, ScratchFolder, ScratchResult, SortedMap, ValueRange, bits,
 };
 
 pub use frame_index::{FrameIndex, IndexedBrick, MaskPolicy, Values, texel_mask};
@@ -52,7 +51,7 @@ pub struct SequenceTree {
 }
 
 /// Reads the bricks of a frame.
-pub type Read = dyn Fn(usize) -> io::Result<Blocks<Brick>> + Send + Sync;
+pub type Read = dyn Fn(usize) -> Result<Blocks<Brick>> + Send + Sync;
 
 /// The way to a frame's voxels.
 pub struct Fetch {
@@ -128,12 +127,8 @@ pub enum Payload {
 #[derive(Debug, thiserror::Error)]
 pub enum DedupError {
     /// The scratch file failed.
-    #[error("a scratch file: {source}")]
-    Scratch {
-        /// Why.
-        #[from]
-        source: io::Error,
-    },
+    #[error(transparent)]
+    Scratch(#[from] ScratchError),
     /// The background is not the one of the frames before.
     #[error("the background is {here}, but {before} in the frames before")]
     Background {
@@ -181,7 +176,7 @@ impl SequenceTree {
     ///
     /// # Errors
     /// When the scratch file cannot be written.
-    pub fn seal(&mut self) -> io::Result<()> {
+    pub fn seal(&mut self) -> ScratchResult<()> {
         self.record_of_brick = SortedMap::default();
         self.record_of_constant = HashMap::new();
         self.nodes.seal()?;
@@ -230,7 +225,7 @@ impl SequenceTree {
     }
 
     /// Puts the voxels of a frame's own bricks into the pool.
-    fn put_voxels(&mut self, frame: usize, voxels: &Blocks<Brick>) -> io::Result<()> {
+    fn put_voxels(&mut self, frame: usize, voxels: &Blocks<Brick>) -> ScratchResult<()> {
         for id in self.own_bricks[frame].clone() {
             if !self.pool.is_there(id) {
                 self.pool.put(id, &voxels[self.pool.place(id)].values)?;
@@ -240,7 +235,7 @@ impl SequenceTree {
     }
 
     /// The same for voxels that were fetched for a frame index from elsewhere: they must be those that it tells of.
-    fn put_fetched(&mut self, frame: usize, voxels: &Blocks<Brick>) -> io::Result<()> {
+    fn put_fetched(&mut self, frame: usize, voxels: &Blocks<Brick>) -> Result<()> {
         let own: Vec<u32> = self.own_bricks[frame].clone().collect();
         let digests = self.pool.digests(&own)?;
         let pool = &self.pool;
@@ -251,16 +246,16 @@ impl SequenceTree {
             })
         };
         if !own.par_iter().zip(&digests).all(is_told) {
-            return Err(Error::Misled("the outline of a frame is not its own".to_owned()).into());
+            return Err(Error::Misled("the outline of a frame is not its own".to_owned()));
         }
-        self.put_voxels(frame, voxels)
+        Ok(self.put_voxels(frame, voxels)?)
     }
 
     /// Sees to it that some bricks of the pool can be read. Frames whose voxels are not there are read for it, whole.
     ///
     /// # Errors
     /// When a frame cannot be read or the scratch file not be written.
-    pub fn fetch(&mut self, ids: &[u32]) -> io::Result<()> {
+    pub fn fetch(&mut self, ids: &[u32]) -> Result<()> {
         let frame = |id: &u32| self.own_bricks.partition_point(|own| own.end <= *id);
         let absent: BTreeSet<usize> = ids.iter().filter(|&&id| !self.pool.is_there(id)).map(frame).collect();
         let absent: Vec<usize> = absent.into_iter().collect();
@@ -273,7 +268,7 @@ impl SequenceTree {
                 self.put_fetched(frame, &voxels?)?;
             }
         }
-        self.pool.flush()
+        Ok(self.pool.flush()?)
     }
 
     /// All frames have one background. A frame without any voxels takes on that of the others.
@@ -307,7 +302,7 @@ impl SequenceTree {
     }
 
     /// The record of a brick of the frame that is being added, whose signs are among `sign_mask`.
-    fn brick(&mut self, place: u32, frame_index: &IndexedBrick, sign_mask: &[Mask512]) -> io::Result<u32> {
+    fn brick(&mut self, place: u32, frame_index: &IndexedBrick, sign_mask: &[Mask512]) -> ScratchResult<u32> {
         let (rule, keeps_mask) = (frame_index.rule(), frame_index.keeps_mask());
         let (range, digest) = match frame_index.values() {
             Values::Constant(value) => {
@@ -366,7 +361,7 @@ impl SequenceTree {
     ///
     /// # Errors
     /// When the scratch file fails.
-    pub fn prune(&mut self, is_empty: impl Fn(u32) -> bool) -> io::Result<()> {
+    pub fn prune(&mut self, is_empty: impl Fn(u32) -> bool) -> ScratchResult<()> {
         let nodes = std::mem::replace(&mut self.nodes, Nodes::new(&self.scratch));
         let runs = std::mem::take(&mut self.runs);
         let mut moved: Vec<Option<u32>> = Vec::with_capacity(nodes.all().len());
@@ -382,7 +377,7 @@ impl SequenceTree {
             }
             let node = (!run.is_empty()).then(|| self.nodes.intern(&left, self.runs.intern(&run)));
             moved.push(node.transpose()?);
-            Ok(())
+            ScratchResult::Ok(())
         })?;
         for frame in &mut self.frames {
             frame.cells.retain_mut(|(_, content)| match content {

@@ -1,12 +1,11 @@
 //! The distinct L2 nodes of a sequence.
 
 use std::collections::HashMap;
-use std::io;
 
 use bytemuck::{Pod, Zeroable};
 use xxhash_rust::xxh3::xxh3_128;
 
-use crate::volume::{Interner, SCRATCH_SMALL, Scratch, ScratchFolder};
+use crate::volume::{Interner, SCRATCH_SMALL, Scratch, ScratchError, ScratchFolder, ScratchResult};
 
 /// Which of a node's 4096 children exist: one bit a child, x slowest.
 pub type Children = [u64; 64];
@@ -46,7 +45,7 @@ impl Nodes {
     ///
     /// # Errors
     /// When the scratch file fails.
-    pub fn intern(&mut self, children: &Children, run: u32) -> io::Result<u32> {
+    pub fn intern(&mut self, children: &Children, run: u32) -> ScratchResult<u32> {
         let bytes: &[u8] = bytemuck::bytes_of(children);
         let count = children.iter().map(|word| word.count_ones()).sum();
         let node = Node { run, count };
@@ -68,7 +67,7 @@ impl Nodes {
     ///
     /// # Errors
     /// When the scratch file cannot be written.
-    pub fn seal(&mut self) -> io::Result<()> {
+    pub fn seal(&mut self) -> ScratchResult<()> {
         self.by_hash = HashMap::new();
         self.nodes.shrink_to_fit();
         self.children.flush()
@@ -83,7 +82,10 @@ impl Nodes {
     ///
     /// # Errors
     /// When the scratch file cannot be read back, or a visit fails.
-    pub fn visit(&self, mut visit: impl FnMut(Node, &Children) -> io::Result<()>) -> io::Result<()> {
+    pub fn visit<E: From<ScratchError>>(
+        &self,
+        mut visit: impl FnMut(Node, &Children) -> Result<(), E>,
+    ) -> Result<(), E> {
         let ids: Vec<u32> = (0..self.nodes.len() as u32).collect();
         for ids in ids.chunks(AT_ONCE) {
             for (&id, children) in ids.iter().zip(&self.children.read_as::<Children>(ids)?) {

@@ -4,178 +4,196 @@ mod tree;
 
 use std::collections::BTreeSet;
 use std::io;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::allocate::Allocation;
 use super::dedup::{FrameTree, SequenceTree};
-use super::quantise::{GridBricks, Outcome, QuantiseError, quantise};
-use super::relayout::{self, Layout};
-use crate::codec::Codec;
+use super::quantise::EncodedGrid;
+use super::relayout::Placement;
+use super::select::GridFacts;
+use crate::codec::{Codec, SequenceRange};
+use crate::error::{Error, Result};
 use crate::pack::layout::{AtlasRecord, CHUNK_BYTES, FrameRecord, GridRecord, encoding, kind};
 use crate::pack::tree::L3Record;
-use crate::pack::{Atlas, FinishedPack, PackWriter, Provenance, SectionSpec, compress_chunk};
-use crate::vdb::GridClass;
+use crate::pack::{Atlas, FinishedPack, PackWriter, Provenance, SectionSpec, StoredChunk, compress_chunk};
+use crate::volume::{ScratchError, ScratchResult};
 use tree::{CellBox, TreeWords};
 
-/// One grid, ready to be written.
-pub struct GridInput {
-    /// Its name.
-    pub name: String,
-    /// What kind of field it holds.
-    pub class: GridClass,
-    /// Whether its source's values are integers.
-    pub is_integer: bool,
-    /// Frames per second; 0 when not stated.
-    pub fps: f32,
-    /// Its frames, in the order of `tree`.
-    pub frames: Vec<FrameInput>,
+/// One grid that is written.
+#[derive(Clone, Copy)]
+pub struct GridParts<'a> {
+    /// What is said of it.
+    pub facts: &'a GridFacts,
     /// Its nodes and bricks.
-    pub tree: SequenceTree,
-    /// Its codecs and ranges; `None` while they are being chosen.
-    pub allocation: Option<Allocation>,
+    pub tree: &'a SequenceTree,
+    /// Their codecs and ranges.
+    pub allocation: &'a Allocation,
 }
 
-impl GridInput {
-    fn allocation(&self) -> &Allocation {
-        self.allocation.as_ref().expect("grids are allocated before they are written")
-    }
+/// A pack that is being written, beside the path where its caller puts it once it is verified: nothing is at that path
+/// that was not there before.
+pub struct Serialiser {
+    path: PathBuf,
+    writer: PackWriter,
+    zstd_level: Option<i32>,
+    words: TreeWords,
+    names: String,
+    atlases: Vec<AtlasRecord>,
+    frames: Vec<FrameRecord>,
+    chunk_lists: Vec<u32>,
+    provenance: Vec<u8>,
 }
 
-/// What the frame table says of a frame beside what its tree says.
-#[derive(Clone, Debug)]
-pub struct FrameInput {
-    /// Its number.
-    pub number: i32,
-    /// Its source's place in the provenance.
-    pub source: u32,
-    /// Index space to world space.
-    pub transform: [f64; 16],
-}
-
-/// The pack cannot be written.
-#[derive(Debug, thiserror::Error)]
-pub enum SerialiseError {
-    /// Writing failed.
-    #[error(transparent)]
-    Io(#[from] io::Error),
-    /// A value does not fit the codec.
-    #[error(transparent)]
-    Quantise(#[from] QuantiseError),
-    /// Something is larger than the format can address.
-    #[error("grid {grid:?}: {what}")]
-    TooLarge {
-        /// The grid.
-        grid: String,
-        /// What, and what to do.
-        what: String,
-    },
-}
-
-/// Writes the pack beside `path`, where its caller puts it once it is verified.
+/// One slab as it lies in the file.
 ///
 /// # Errors
-/// [`SerialiseError`]. Nothing is left at `path` that was not there before.
-pub fn serialise(
-    path: &Path,
-    grids: &mut [GridInput],
-    provenance: &Provenance,
-    zstd_level: Option<i32>,
-    mut progress: impl FnMut(u64),
-) -> Result<FinishedPack, SerialiseError> {
-    let layout = relayout::place(&grids.iter().map(GridInput::allocation).collect::<Vec<_>>());
-    if layout.atlases.iter().any(|a| a.bricks >= L3Record::MAX_SLOTS) {
-        return Err(too_large(
-            &grids[0].name,
-            "more distinct bricks of one codec than the 2^27 that a pack holds: use fewer frames".to_owned(),
-        ));
-    }
-    let boxes = grids.iter().map(CellBox::around).collect::<Result<Vec<_>, _>>()?;
-    let words = TreeWords::new(grids, &boxes, &layout.atlases);
+/// When zstd fails.
+pub fn compress_slab(atlas: &Atlas, slab: Vec<u8>, zstd_level: Option<i32>) -> io::Result<StoredChunk> {
+    let encoding = encoding::of(kind::TEXELS, atlas.codec as u32, zstd_level.is_some());
+    compress_chunk(slab, encoding, zstd_level.unwrap_or(0))
+}
 
-    let level = zstd_level.unwrap_or(0);
-    let names: String = grids.iter().map(|g| g.name.as_str()).collect();
-    let frame_count: usize = grids.iter().map(|g| g.frames.len()).sum();
-    let provenance = provenance.to_json()?;
-    let atlases: Vec<AtlasRecord> = layout.atlases.iter().map(atlas_record).collect();
+impl Serialiser {
+    /// Begins a pack: what is not known yet is texels, errors and packing axes.
+    ///
+    /// # Errors
+    /// When the file cannot be written, or something is larger than the format can address.
+    pub fn begin(
+        path: &Path,
+        grids: &[GridParts],
+        placement: &Placement,
+        provenance: &Provenance,
+        zstd_level: Option<i32>,
+    ) -> Result<Self> {
+        if placement.atlases.iter().any(|a| a.bricks >= L3Record::MAX_SLOTS) {
+            return Err(too_large(
+                &grids[0].facts.name,
+                "more distinct bricks of one codec than the 2^27 that a pack holds: use fewer frames",
+            ));
+        }
+        let boxes = boxes(grids.iter().map(|grid| (grid.facts, grid.tree)))?;
+        let sequences: Vec<SequenceRange> = grids.iter().map(|grid| grid.allocation.sequence).collect();
+        let trees: Vec<&SequenceTree> = grids.iter().map(|grid| grid.tree).collect();
+        let words = TreeWords::new(&trees, &boxes, &sequences, &placement.atlases);
 
-    let encoding = |kind, codec| encoding::of(kind, codec, zstd_level.is_some());
-    let spec = |kind, raw_bytes: usize| SectionSpec {
-        kind,
-        codec: 0,
-        encoding: encoding(kind, 0),
-        chunk_bytes: CHUNK_BYTES,
-        raw_bytes: raw_bytes as u64,
-    };
-    // Texels come first, so that which chunks a frame needs is known before the sections of unknown length
-    // are: those and the tables hold what encoding cost, and the tree the packing axes that it chose.
-    let mut specs: Vec<SectionSpec> = layout
-        .atlases
-        .iter()
-        .map(|atlas| SectionSpec {
+        let names: String = grids.iter().map(|grid| grid.facts.name.as_str()).collect();
+        let provenance = provenance.to_json().map_err(Error::io(path))?;
+        let atlases: Vec<AtlasRecord> = placement.atlases.iter().map(atlas_record).collect();
+        let (frames, chunk_lists) = frame_tables(grids, &frame_slabs(grids, placement));
+
+        let encoding = |kind, codec| encoding::of(kind, codec, zstd_level.is_some());
+        let spec = |kind, raw_bytes: usize| SectionSpec {
+            kind,
+            codec: 0,
+            encoding: encoding(kind, 0),
+            chunk_bytes: CHUNK_BYTES,
+            raw_bytes: raw_bytes as u64,
+        };
+        let texels = |atlas: &Atlas| SectionSpec {
             kind: kind::TEXELS,
             codec: atlas.codec as u32,
             encoding: encoding(kind::TEXELS, atlas.codec as u32),
             chunk_bytes: atlas.slab_bytes() as u32,
             raw_bytes: atlas.bytes(),
-        })
-        .collect();
-    let (mut frames, lists) = frame_tables(grids, &frame_slabs(grids, &layout));
-    specs.extend([
-        spec(kind::GRIDS, grids.len() * size_of::<GridRecord>()),
-        spec(kind::NAMES, names.len()),
-        spec(kind::ATLASES, size_of_val(&*atlases)),
-        spec(kind::FRAME_CHUNKS, size_of_val(&*lists)),
-        spec(kind::PROVENANCE, provenance.len()),
-        spec(kind::FRAMES, frame_count * size_of::<FrameRecord>()),
-        spec(kind::TREE, words.len() * 4),
-    ]);
+        };
+        // Texels come first, so that which chunks a frame needs is known before the sections of unknown length
+        // are: those and the tables hold what encoding cost, and the tree the packing axes that it chose.
+        let mut specs: Vec<SectionSpec> = placement.atlases.iter().map(texels).collect();
+        specs.extend([
+            spec(kind::GRIDS, grids.len() * size_of::<GridRecord>()),
+            spec(kind::NAMES, names.len()),
+            spec(kind::ATLASES, size_of_val(&*atlases)),
+            spec(kind::FRAME_CHUNKS, size_of_val(&*chunk_lists)),
+            spec(kind::PROVENANCE, provenance.len()),
+            spec(kind::FRAMES, size_of_val(&*frames)),
+            spec(kind::TREE, words.len() * 4),
+        ]);
+        let writer = PackWriter::create(path, specs).map_err(Error::io(path))?;
+        let path = path.to_owned();
+        Ok(Self { path, writer, zstd_level, words, names, atlases, frames, chunk_lists, provenance })
+    }
 
-    let mut writer = PackWriter::create(path, specs)?;
-    let mut outcomes: Vec<Outcome> = grids.iter().map(GridInput::allocation).map(Outcome::before).collect();
-    let mut sources: Vec<GridBricks> = grids
-        .iter_mut()
-        .filter_map(|g| Some(GridBricks { tree: &mut g.tree, allocation: g.allocation.as_mut()? }))
-        .collect();
-    let compressed =
-        |atlas: &Atlas, slab| compress_chunk(slab, encoding(kind::TEXELS, atlas.codec as u32), level);
-    quantise(&layout, &mut sources, &mut outcomes, compressed, |atlas, slab, chunk| {
-        if slab == 0 {
-            writer.begin()?;
+    /// Writes the next slab; those of an atlas in order, one atlas after another.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn slab(&mut self, slab: u32, chunk: &StoredChunk) -> Result<()> {
+        let begun = if slab == 0 { self.writer.begin() } else { Ok(()) };
+        begun.and_then(|()| self.writer.chunk(chunk)).map_err(Error::io(&self.path))
+    }
+
+    /// Writes the tables and the tree: the pack is whole then.
+    ///
+    /// # Errors
+    /// When the file cannot be written, or a scratch file cannot be read back.
+    pub fn finish(
+        mut self,
+        grids: &[GridParts],
+        placement: &Placement,
+        encoded: &[EncodedGrid],
+    ) -> Result<FinishedPack> {
+        set_errors(&mut self.frames, grids, encoded)?;
+        let records = grid_records(grids, encoded)?;
+        let level = self.zstd_level.unwrap_or(0);
+        let sections: [&[u8]; 6] = [
+            bytemuck::cast_slice(&records),
+            self.names.as_bytes(),
+            bytemuck::cast_slice(&self.atlases),
+            bytemuck::cast_slice(&self.chunk_lists),
+            &self.provenance,
+            bytemuck::cast_slice(&self.frames),
+        ];
+        for section in sections {
+            self.writer.section(section, level).map_err(Error::io(&self.path))?;
         }
-        progress(atlas.slab_bricks().into());
-        writer.chunk(&chunk)
-    })?;
-    set_errors(&mut frames, grids)?;
-    writer.section(bytemuck::cast_slice(&grid_records(grids)?), level)?;
-    writer.section(names.as_bytes(), level)?;
-    writer.section(bytemuck::cast_slice(&atlases), level)?;
-    writer.section(bytemuck::cast_slice(&lists), level)?;
-    writer.section(&provenance, level)?;
-    writer.section(bytemuck::cast_slice(&frames), level)?;
-    writer.words(level, |sink| words.write(grids, &layout, &outcomes, sink))?;
-    Ok(writer.finish()?)
+        let words = &self.words;
+        self.writer
+            .words(level, |sink| {
+                words.write(grids, placement, encoded, |words| sink(words).map_err(WriteError::Pack))
+            })
+            .map_err(|error| match error {
+                WriteError::Pack(source) => Error::io(&self.path)(source),
+                WriteError::Scratch(error) => error.into(),
+            })?;
+        self.writer.finish().map_err(Error::io(&self.path))
+    }
+}
+
+/// What can fail while the tree is written.
+enum WriteError {
+    Pack(io::Error),
+    Scratch(ScratchError),
+}
+
+impl From<io::Error> for WriteError {
+    fn from(error: io::Error) -> Self {
+        Self::Pack(error)
+    }
+}
+
+impl From<ScratchError> for WriteError {
+    fn from(error: ScratchError) -> Self {
+        Self::Scratch(error)
+    }
 }
 
 /// Bytes of the tree and its masks.
 ///
 /// # Errors
-/// [`SerialiseError::TooLarge`].
-pub fn tree_bytes(grids: &[GridInput]) -> Result<u64, SerialiseError> {
-    let boxes = grids.iter().map(CellBox::around).collect::<Result<Vec<_>, _>>()?;
-    Ok(TreeWords::new(grids, &boxes, &[]).len() as u64 * 4)
+/// When a grid is larger than the format can address.
+pub fn tree_bytes<'a>(grids: impl Iterator<Item = (&'a GridFacts, &'a SequenceTree)> + Clone) -> Result<u64> {
+    let boxes = boxes(grids.clone())?;
+    let trees: Vec<&SequenceTree> = grids.map(|(_, tree)| tree).collect();
+    let sequences = vec![SequenceRange::default(); trees.len()];
+    Ok(TreeWords::new(&trees, &boxes, &sequences, &[]).len() as u64 * 4)
 }
 
-/// Bytes of tree, masks and texture pages: what a GPU holds.
-///
-/// # Errors
-/// [`SerialiseError::TooLarge`].
-pub fn gpu_bytes(grids: &[GridInput]) -> Result<u64, SerialiseError> {
-    let layout = relayout::place(&grids.iter().map(GridInput::allocation).collect::<Vec<_>>());
-    Ok(tree_bytes(grids)? + layout.atlases.iter().map(Atlas::bytes).sum::<u64>())
+fn boxes<'a>(grids: impl Iterator<Item = (&'a GridFacts, &'a SequenceTree)>) -> Result<Vec<CellBox>> {
+    grids.map(|(facts, tree)| CellBox::around(&facts.name, tree)).collect()
 }
 
-fn too_large(grid: &str, what: String) -> SerialiseError {
-    SerialiseError::TooLarge { grid: grid.to_owned(), what }
+fn too_large(grid: &str, what: &str) -> Error {
+    Error::Unsupported(format!("grid {grid:?}: {what}"))
 }
 
 fn atlas_record(atlas: &Atlas) -> AtlasRecord {
@@ -183,44 +201,44 @@ fn atlas_record(atlas: &Atlas) -> AtlasRecord {
     AtlasRecord { codec: codec as u32, bricks, columns, rows, slabs, page_slabs }
 }
 
-fn grid_records(grids: &[GridInput]) -> io::Result<Vec<GridRecord>> {
+fn grid_records(grids: &[GridParts], encoded: &[EncodedGrid]) -> ScratchResult<Vec<GridRecord>> {
     let (mut name_offset, mut first_frame) = (0, 0);
-    let record = |g: &GridInput| {
+    let record = |(g, encoded): (&GridParts, &EncodedGrid)| {
         let active = g.tree.active_range();
         let record = GridRecord {
             name_offset,
-            name_bytes: g.name.len() as u32,
-            class: g.class as u32,
+            name_bytes: g.facts.name.len() as u32,
+            class: g.facts.class as u32,
             first_frame,
-            frames: g.frames.len() as u32,
-            fps: g.fps,
+            frames: g.facts.frames.len() as u32,
+            fps: g.facts.fps,
             active_min: active.map_or(0.0, |r| r.min),
             active_max: active.map_or(0.0, |r| r.max),
-            codec_error_l2s: codec_error_l2s(g)?,
+            codec_error_l2s: codec_error_l2s(g, encoded)?,
         };
         name_offset += record.name_bytes;
         first_frame += record.frames;
         Ok(record)
     };
-    grids.iter().map(record).collect()
+    grids.iter().zip(encoded).map(record).collect()
 }
 
 /// For each grid and frame the chunks that its bricks lie in, ascending: the texel sections are the first of the
 /// file, and a slab is a chunk.
-fn frame_slabs(grids: &[GridInput], layout: &Layout) -> Vec<Vec<Vec<u32>>> {
+fn frame_slabs(grids: &[GridParts], placement: &Placement) -> Vec<Vec<Vec<u32>>> {
     let mut first_chunk = [0; Codec::WITH_TEXELS.len() + 1];
     let mut slab_bricks = [1; Codec::WITH_TEXELS.len() + 1];
     let mut chunks = 0;
-    for atlas in &layout.atlases {
+    for atlas in &placement.atlases {
         first_chunk[atlas.codec as usize] = chunks;
         slab_bricks[atlas.codec as usize] = atlas.slab_bricks();
         chunks += atlas.slabs;
     }
-    let of_grid = |(g, grid): (usize, &GridInput)| {
+    let of_grid = |(g, grid): (usize, &GridParts)| {
         let chunk = |id: u32| {
-            let codec = grid.allocation().codec(id);
+            let codec = grid.allocation.codec(id);
             let tag = codec as usize;
-            (codec != Codec::Constant).then(|| first_chunk[tag] + layout.slot(g, id) / slab_bricks[tag])
+            (codec != Codec::Constant).then(|| first_chunk[tag] + placement.slot(g, id) / slab_bricks[tag])
         };
         let of_frame = |frame| grid.tree.frame_bricks(frame).filter_map(chunk).collect::<BTreeSet<u32>>();
         grid.tree.frames.iter().map(|frame| of_frame(frame).into_iter().collect()).collect()
@@ -229,31 +247,38 @@ fn frame_slabs(grids: &[GridInput], layout: &Layout) -> Vec<Vec<Vec<u32>>> {
 }
 
 /// What each codec cost a grid: the root of the squared error of its bricks over all frames, by tag.
-fn codec_error_l2s(grid: &GridInput) -> io::Result<[f32; Codec::WITH_TEXELS.len() + 1]> {
+fn codec_error_l2s(
+    grid: &GridParts,
+    encoded: &EncodedGrid,
+) -> ScratchResult<[f32; Codec::WITH_TEXELS.len() + 1]> {
     let mut squares = [0.0; Codec::WITH_TEXELS.len() + 1];
     for frame in &grid.tree.frames {
-        for (id, square) in squares_of(grid, frame)? {
-            squares[grid.allocation().codec(id) as usize] += square;
+        for (id, square) in squares_of(grid, encoded, frame)? {
+            squares[grid.allocation.codec(id) as usize] += square;
         }
     }
-    squares[Codec::Constant as usize] += grid.allocation().empty_squares.iter().sum::<f64>();
+    squares[Codec::Constant as usize] += grid.allocation.empty_squares.iter().sum::<f64>();
     Ok(squares.map(|s: f64| (s.sqrt() as f32).min(f32::MAX)))
 }
 
 /// The squared errors of a frame's bricks.
-fn squares_of(grid: &GridInput, frame: &FrameTree) -> io::Result<impl Iterator<Item = (u32, f64)>> {
+fn squares_of(
+    grid: &GridParts,
+    encoded: &EncodedGrid,
+    frame: &FrameTree,
+) -> ScratchResult<impl Iterator<Item = (u32, f64)> + use<>> {
     let ids: Vec<u32> = grid.tree.frame_bricks(frame).collect();
-    let error_l2s = grid.allocation().error_l2s.read(&ids)?;
+    let error_l2s = encoded.error_l2s(grid.allocation, &ids)?;
     Ok(ids.into_iter().zip(error_l2s.into_iter().map(|error_l2| error_l2.powi(2))))
 }
 
 /// Fills in what encoding cost each frame.
-fn set_errors(frames: &mut [FrameRecord], grids: &[GridInput]) -> io::Result<()> {
+fn set_errors(frames: &mut [FrameRecord], grids: &[GridParts], encoded: &[EncodedGrid]) -> ScratchResult<()> {
     let mut frames = frames.iter_mut();
-    for grid in grids {
-        let mut empty = grid.allocation().empty_squares.iter();
+    for (grid, encoded) in grids.iter().zip(encoded) {
+        let mut empty = grid.allocation.empty_squares.iter();
         for (tree, frame) in grid.tree.frames.iter().zip(&mut frames) {
-            let squares: f64 = squares_of(grid, tree)?.map(|(_, square)| square).sum();
+            let squares: f64 = squares_of(grid, encoded, tree)?.map(|(_, square)| square).sum();
             let squares = squares + empty.next().copied().unwrap_or(0.0);
             frame.error_l2 = squares.sqrt();
         }
@@ -261,11 +286,11 @@ fn set_errors(frames: &mut [FrameRecord], grids: &[GridInput]) -> io::Result<()>
     Ok(())
 }
 
-fn frame_tables(grids: &[GridInput], slabs: &[Vec<Vec<u32>>]) -> (Vec<FrameRecord>, Vec<u32>) {
+fn frame_tables(grids: &[GridParts], slabs: &[Vec<Vec<u32>>]) -> (Vec<FrameRecord>, Vec<u32>) {
     let mut records = Vec::new();
     let mut lists: Vec<u32> = Vec::new();
     for (g, (grid, slabs)) in grids.iter().zip(slabs).enumerate() {
-        for ((input, frame), slabs) in grid.frames.iter().zip(&grid.tree.frames).zip(slabs) {
+        for ((input, frame), slabs) in grid.facts.frames.iter().zip(&grid.tree.frames).zip(slabs) {
             records.push(FrameRecord {
                 grid: g as u32,
                 number: input.number,

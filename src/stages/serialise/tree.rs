@@ -1,19 +1,19 @@
 //! The words of the tree section, as `docs/format.md`, "The tree", has them.
 
 use std::collections::BTreeMap;
-use std::io;
 
-use super::{GridInput, SerialiseError, too_large};
-use crate::codec::Codec;
+use super::{GridParts, too_large};
+use crate::codec::{Codec, SequenceRange};
+use crate::error::Result;
 use crate::pack::Atlas;
 use crate::pack::tree::{
     self, GRID_WORDS, HEADER_WORDS, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS,
 };
 use crate::stages::allocate::Coding;
 use crate::stages::dedup::{CellRef, FrameTree, Payload, SequenceTree};
-use crate::stages::quantise::Outcome;
-use crate::stages::relayout::Layout;
-use crate::volume::{CELL_DIM, Constant, Coord, Interner, ROOT_DIM};
+use crate::stages::quantise::EncodedGrid;
+use crate::stages::relayout::Placement;
+use crate::volume::{CELL_DIM, Constant, Coord, Interner, ROOT_DIM, ScratchError};
 
 /// L1 nodes that all frames of a grid may have room for: 64 MB of links. A box of 40 of them an axis is
 /// 160,000 voxels wide, for 240 frames; only stray voxels far from the rest need more.
@@ -29,10 +29,10 @@ pub(super) struct CellBox {
 }
 
 impl CellBox {
-    pub fn around(grid: &GridInput) -> Result<Self, SerialiseError> {
+    pub fn around(name: &str, tree: &SequenceTree) -> Result<Self> {
         let mut min = [i64::MAX; 3];
         let mut max = [i64::MIN; 3];
-        let frames = || grid.tree.frames.iter();
+        let frames = || tree.frames.iter();
         let cells = frames().flat_map(|f| f.cells.iter().map(|(at, _)| (at, CELL_DIM)));
         let roots = frames().flat_map(|f| f.roots.iter().map(|(at, _)| (at, ROOT_DIM)));
         for (at, dim) in cells.chain(roots) {
@@ -54,11 +54,11 @@ impl CellBox {
         }
         let extent: [i64; 3] = std::array::from_fn(|a| max[a] - min[a]);
         let roots = if one_node { [1; 3] } else { extent.map(|e| e / root) };
-        let frames = grid.frames.len().max(1) as i64;
+        let frames = tree.frames.len().max(1) as i64;
         if roots.iter().try_fold(frames, |n, r| n.checked_mul(*r)).is_none_or(|n| n > MAX_ROOTS) {
             return Err(too_large(
-                &grid.name,
-                format!(
+                name,
+                &format!(
                     "its voxels lie in a box of {} × {} × {} voxels, too sparse to address: \
                      delete stray voxels far from the rest, or pack its parts apart",
                     extent[0], extent[1], extent[2]
@@ -103,30 +103,35 @@ pub(super) struct TreeWords {
 
 impl TreeWords {
     /// Plans them for texels in these atlases.
-    pub fn new(grids: &[GridInput], boxes: &[CellBox], atlases: &[Atlas]) -> Self {
+    pub fn new(
+        trees: &[&SequenceTree],
+        boxes: &[CellBox],
+        sequences: &[SequenceRange],
+        atlases: &[Atlas],
+    ) -> Self {
         let mut constants = Interner::<u32>::default();
         let grids_at = HEADER_WORDS;
-        let roots_at = grids_at + grids.len() * GRID_WORDS;
-        let root_words: usize = grids.iter().zip(boxes).map(|(g, b)| g.frames.len() * b.root_count()).sum();
+        let roots_at = grids_at + trees.len() * GRID_WORDS;
+        let root_words: usize = trees.iter().zip(boxes).map(|(t, b)| t.frames.len() * b.root_count()).sum();
         let l1_at = roots_at + root_words;
 
         let mut l1 = Interner::<u32>::default();
         let mut headers = Vec::new();
         let mut roots = Vec::new();
         let mut nodes = 0u32;
-        for (grid, bounds) in grids.iter().zip(boxes) {
-            headers.extend(grid_header(grid, bounds, roots_at + roots.len()));
-            for frame in &grid.tree.frames {
+        for ((tree, bounds), sequence) in trees.iter().zip(boxes).zip(sequences) {
+            headers.extend(grid_header(tree, bounds, sequence, roots_at + roots.len()));
+            for frame in &tree.frames {
                 roots.extend(frame_roots(frame, bounds, l1_at, nodes, &mut l1, &mut constants));
             }
-            nodes += grid.tree.nodes.all().len() as u32;
+            nodes += tree.nodes.all().len() as u32;
         }
 
         let node_at = l1_at + l1.items().len();
         let record_at = node_at + nodes as usize * NODE_WORDS;
-        let records: usize = grids.iter().map(|g| run_len(&g.tree)).sum();
+        let records: usize = trees.iter().map(|tree| run_len(tree)).sum();
         let mask_at = record_at + records * RECORD_WORDS;
-        let masks: usize = grids.iter().map(|g| mask_len(&g.tree)).sum();
+        let masks: usize = trees.iter().map(|tree| mask_len(tree)).sum();
         let constant_at = mask_at + masks * MASK_WORDS;
         let len = constant_at + constants.items().len();
 
@@ -135,7 +140,7 @@ impl TreeWords {
             use tree::header as h;
             for (place, value) in [
                 (h::WORDS, len),
-                (h::GRIDS, grids.len()),
+                (h::GRIDS, trees.len()),
                 (h::GRID_AT, grids_at),
                 (h::NODE_AT, node_at),
                 (h::NODES, nodes as usize),
@@ -169,13 +174,13 @@ impl TreeWords {
     ///
     /// # Errors
     /// When a scratch file cannot be read back, or the sink fails.
-    pub fn write(
+    pub fn write<E: From<ScratchError>>(
         &self,
-        grids: &[GridInput],
-        layout: &Layout,
-        outcomes: &[Outcome],
-        mut sink: impl FnMut(&[u32]) -> io::Result<()>,
-    ) -> io::Result<()> {
+        grids: &[GridParts],
+        placement: &Placement,
+        encoded: &[EncodedGrid],
+        mut sink: impl FnMut(&[u32]) -> Result<(), E>,
+    ) -> Result<(), E> {
         sink(&self.head)?;
         for (grid, first_record) in with_first(grids, run_len) {
             grid.tree.nodes.visit(|node, children| {
@@ -185,10 +190,10 @@ impl TreeWords {
                 sink(&[first_record + node.run])
             })?;
         }
-        for ((g, (grid, first_mask)), outcome) in with_first(grids, mask_len).enumerate().zip(outcomes) {
-            let slot = |id| layout.slot(g, id);
+        for ((g, (grid, first_mask)), encoded) in with_first(grids, mask_len).enumerate().zip(encoded) {
+            let slot = |id| placement.slot(g, id);
             for &entry in grid.tree.runs.items() {
-                sink(&l3_record(grid, entry, slot, outcome, first_mask).to_words())?;
+                sink(&l3_record(grid, entry, slot, encoded, first_mask).to_words())?;
             }
         }
         let mut masks = grids.iter().flat_map(|grid| grid.tree.masks.items());
@@ -198,13 +203,13 @@ impl TreeWords {
 }
 
 /// Grids, each with how much of something those before it have.
-fn with_first(
-    grids: &[GridInput],
+fn with_first<'a>(
+    grids: &'a [GridParts<'a>],
     len: impl Fn(&SequenceTree) -> usize,
-) -> impl Iterator<Item = (&GridInput, u32)> {
+) -> impl Iterator<Item = (&'a GridParts<'a>, u32)> {
     grids.iter().scan(0, move |first, grid| {
         let own = *first;
-        *first += len(&grid.tree) as u32;
+        *first += len(grid.tree) as u32;
         Some((grid, own))
     })
 }
@@ -217,18 +222,22 @@ fn mask_len(tree: &SequenceTree) -> usize {
     tree.masks.items().len()
 }
 
-fn grid_header(grid: &GridInput, bounds: &CellBox, root_at: usize) -> [u32; GRID_WORDS] {
-    use tree::grid as g;
+fn grid_header(
+    tree: &SequenceTree,
+    bounds: &CellBox,
+    sequence: &SequenceRange,
+    root_at: usize,
+) -> [u32; GRID_WORDS] {
+    use crate::pack::tree::grid as g;
     let mut words = [0; GRID_WORDS];
     words[g::ORIGIN..g::ORIGIN + 3].copy_from_slice(&bounds.origin.0.map(|v| v as u32));
     words[g::CELLS..g::CELLS + 3].copy_from_slice(&bounds.cells);
     words[g::ROOTS..g::ROOTS + 3].copy_from_slice(&bounds.roots);
-    let sequence = grid.allocation.as_ref().map(|a| a.sequence).unwrap_or_default();
     words[g::LO] = sequence.lo.to_bits();
     words[g::SPAN] = sequence.span.to_bits();
-    words[g::BACKGROUND] = grid.tree.background.to_bits();
+    words[g::BACKGROUND] = tree.background.to_bits();
     words[g::ROOT_AT] = root_at as u32;
-    words[g::FRAMES] = grid.frames.len() as u32;
+    words[g::FRAMES] = tree.frames.len() as u32;
     words
 }
 
@@ -272,23 +281,23 @@ fn frame_roots(
 }
 
 fn l3_record(
-    grid: &GridInput,
+    grid: &GridParts,
     entry: u32,
     slot: impl Fn(u32) -> u32,
-    outcome: &Outcome,
+    encoded: &EncodedGrid,
     first_mask: u32,
 ) -> L3Record {
     let record = grid.tree.record(entry);
     let (codec, axis, slot, word2) = match record.payload() {
         Payload::Constant(value) => (Codec::Constant, 0, 0, value.to_bits()),
         Payload::Brick(id) => {
-            let allocation = grid.allocation();
+            let allocation = grid.allocation;
             match allocation.coding(id) {
                 Coding::Empty => (Codec::Constant, 0, 0, grid.tree.background.to_bits()),
                 Coding::Constant(value) => (Codec::Constant, 0, 0, value.to_bits()),
                 _ => {
-                    let range = allocation.range(&grid.tree, id).to_word();
-                    (allocation.codec(id), outcome.axis(allocation, id), slot(id), range)
+                    let range = allocation.range(grid.tree, id).to_word();
+                    (allocation.codec(id), encoded.axis(allocation, id), slot(id), range)
                 }
             }
         }

@@ -1,11 +1,12 @@
 //! Stages 5 and 7: what each codec makes of each brick, measured on decoded values. Made once: what was tried to
-//! choose a codec is what goes into the pack, and what an earlier build made is taken from the cache.
+//! choose a codec is what goes into the pack.
 
-mod cached;
 mod measure;
+mod memo;
 mod spilled;
 
-use std::io;
+use std::collections::BTreeSet;
+use std::ops::Range;
 use std::time::{Duration, Instant};
 
 use half::f16;
@@ -14,16 +15,18 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::dedup::{SequenceTree, texel_mask};
-use crate::cache::pods;
+use crate::cancel::CancelToken;
 use crate::codec::{BATCH, BrickRange, Codec, SequenceRange, Texels, decode, encode, spread};
-use crate::interrupt;
+use crate::error::Result;
+use crate::pods;
 use crate::profile;
 use crate::settings::RangeMode;
-use crate::volume::{BRICK_VOXELS, BRICKS_IN_FLIGHT, Brick, InactiveRule, Mask512};
-use cached::Batches;
-pub use cached::{Batch, GridCache};
+use crate::volume::{
+    BRICK_VOXELS, BRICKS_IN_FLIGHT, Brick, InactiveRule, Mask512, ScratchResult, ValueRange,
+};
 pub use measure::Measure;
-use spilled::{Note, Spilled};
+pub use memo::Memo;
+pub use spilled::Note;
 
 /// What one codec does to one brick.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -77,7 +80,8 @@ pub enum Kind {
 }
 
 impl Kind {
-    const ALL: [Self; 4] = [
+    /// All of them.
+    pub const ALL: [Self; 4] = [
         Self::Plain,
         Self::Texels(KeptCodec::Bc7),
         Self::Texels(KeptCodec::Bc4),
@@ -85,7 +89,7 @@ impl Kind {
     ];
 
     /// Its place among them.
-    fn index(self) -> usize {
+    pub fn index(self) -> usize {
         match self {
             Self::Plain => 0,
             Self::Texels(codec) => 1 + codec as usize,
@@ -93,7 +97,7 @@ impl Kind {
     }
 
     /// Notes that are kept of a brick.
-    fn notes(self) -> usize {
+    pub fn notes(self) -> usize {
         match self {
             Self::Plain => Plain::NOTES,
             Self::Texels(_) => 1,
@@ -101,7 +105,7 @@ impl Kind {
     }
 
     /// Bytes of texels of a brick.
-    fn texels(self) -> usize {
+    pub fn texels(self) -> usize {
         match self {
             Self::Plain => 0,
             Self::Texels(codec) => codec.codec().layout().brick_bytes(),
@@ -166,48 +170,141 @@ pub struct Terms {
     pub error_below: Option<f64>,
 }
 
-/// Bricks of a batch at least: four fill the lanes of the BC7 encoder.
+/// Bricks that one thread encodes together at least: four fill the lanes of the BC7 encoder.
 const LEAST_BATCH: usize = 8;
+
+/// Bricks of a [`Batch`] at most: with 512 bytes of texels each, a megabyte.
+pub const BATCH_BRICKS: u32 = 2048;
 
 /// How long a build may go on before what it made is kept, so that one that is killed loses no more than that.
 const SAVE_EVERY: Duration = Duration::from_secs(2);
 
+/// Bricks of one frame that are kept and compared together.
+pub struct Batch {
+    /// The frame's place in the sequence.
+    pub frame: usize,
+    /// The batch's place in its frame.
+    pub part: u32,
+    /// The bricks of the pool that the frame had first and that are in this part of it.
+    pub ids: Range<u32>,
+}
+
+/// Results of earlier builds. Whoever runs the stages puts it around an [`EncoderCache`]; without one everything is
+/// made.
+pub trait EarlierResults: Send + Sync {
+    /// Adds to `memo` what earlier builds made of the bricks of some batches.
+    ///
+    /// # Errors
+    /// When a scratch file fails.
+    fn load(
+        &mut self,
+        memo: &mut Memo,
+        tree: &SequenceTree,
+        batches: &[Batch],
+        wanted: &[(usize, Kind)],
+    ) -> ScratchResult<()>;
+
+    /// Notes that `memo` has results of some batches that no earlier build made.
+    fn note_made(&mut self, batches: &BTreeSet<usize>, kind: Kind);
+
+    /// Keeps those for later builds.
+    ///
+    /// # Errors
+    /// When a scratch file cannot be read back.
+    fn save(&mut self, memo: &Memo, tree: &SequenceTree, batches: &[Batch]) -> ScratchResult<()>;
+}
+
 /// What each codec does to each brick of a grid, as far as someone asked.
-pub struct Encodings {
+pub struct EncoderCache {
     /// The range that brick ranges are fractions of.
     pub sequence: SequenceRange,
     terms: Terms,
     rules: Vec<InactiveRule>,
-    kept: [Spilled; Kind::ALL.len()],
-    batches: Batches,
+    memo: Memo,
+    batches: Vec<Batch>,
+    /// For each of them the kinds of which earlier results were asked for.
+    is_loaded: Vec<[bool; Kind::ALL.len()]>,
+    earlier: Option<Box<dyn EarlierResults>>,
     saved: Instant,
+    cancel: CancelToken,
 }
 
-impl Encodings {
-    /// Nothing is tried yet. `None` when the sequence's values span more than an `f32` can hold. With a cache, what it
-    /// has is taken from there, and what is made goes into it.
-    pub fn new(tree: &SequenceTree, terms: Terms, cache: Option<GridCache>) -> Option<Self> {
+impl EncoderCache {
+    /// Nothing is tried yet. `None` when the sequence's values span more than an `f32` can hold.
+    pub fn new(tree: &SequenceTree, terms: Terms, cancel: CancelToken) -> Option<Self> {
         let sequence = match tree.value_range() {
             Some(range) => SequenceRange::around(range.min, range.max)?,
             None => SequenceRange::default(),
         };
-        let batches = Batches::new(tree, cache, &sequence, &terms);
+        let batches = batches(tree);
         Some(Self {
             rules: tree.brick_rules(),
-            kept: Kind::ALL.map(|kind| Spilled::new(&tree.scratch, kind)),
+            memo: Memo::new(tree),
+            is_loaded: vec![Default::default(); batches.len()],
             batches,
+            earlier: None,
             saved: Instant::now(),
             sequence,
             terms,
+            cancel,
         })
+    }
+
+    /// From now on takes results of earlier builds, and gives them what is made.
+    pub fn reuse(&mut self, earlier: Box<dyn EarlierResults>) {
+        self.earlier = Some(earlier);
+    }
+
+    /// The parts in which bricks are kept, in the order of the pool.
+    pub fn batches(&self) -> &[Batch] {
+        &self.batches
+    }
+
+    /// What the errors of bricks depend on.
+    pub fn terms(&self) -> &Terms {
+        &self.terms
+    }
+
+    /// The batches that some bricks, ascending, are in.
+    fn batches_of(&self, ids: &[u32]) -> BTreeSet<usize> {
+        ids.iter().map(|id| self.batches.partition_point(|batch| batch.ids.end <= *id)).collect()
+    }
+
+    fn load(&mut self, tree: &SequenceTree, ids: &[u32], kinds: &[Kind]) -> ScratchResult<()> {
+        if self.earlier.is_none() {
+            return Ok(());
+        }
+        let mut wanted = Vec::new();
+        for batch in self.batches_of(ids) {
+            for &kind in kinds {
+                if !std::mem::replace(&mut self.is_loaded[batch][kind.index()], true) {
+                    wanted.push((batch, kind));
+                }
+            }
+        }
+        let earlier = self.earlier.as_mut().expect("there is one");
+        earlier.load(&mut self.memo, tree, &self.batches, &wanted)?;
+        self.memo.flush()
+    }
+
+    /// Keeps what was made for later builds.
+    ///
+    /// # Errors
+    /// When a scratch file cannot be read back.
+    pub fn save(&mut self, tree: &SequenceTree) -> ScratchResult<()> {
+        self.saved = Instant::now();
+        match &mut self.earlier {
+            Some(earlier) => earlier.save(&self.memo, tree, &self.batches),
+            None => Ok(()),
+        }
     }
 
     /// What some bricks, which were tried, would be without texels.
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn plain(&self, ids: &[u32]) -> io::Result<Vec<Plain>> {
-        let notes = self.kept(Kind::Plain).notes(ids)?;
+    pub fn plain(&self, ids: &[u32]) -> ScratchResult<Vec<Plain>> {
+        let notes = self.memo.notes(Kind::Plain, ids)?;
         Ok(notes.as_chunks().0.iter().copied().map(Plain::from_notes).collect())
     }
 
@@ -215,33 +312,26 @@ impl Encodings {
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn costs(&self, ids: &[u32], codec: KeptCodec) -> io::Result<Vec<Cost>> {
-        Ok(self.kept(Kind::Texels(codec)).notes(ids)?.iter().map(Note::cost).collect())
+    pub fn costs(&self, ids: &[u32], codec: KeptCodec) -> ScratchResult<Vec<Cost>> {
+        Ok(self.memo.notes(Kind::Texels(codec), ids)?.iter().map(Note::cost).collect())
     }
 
     /// What a codec made of some bricks that it was tried on.
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn texels(&self, ids: &[u32], codec: KeptCodec) -> io::Result<Tried> {
-        let kept = self.kept(Kind::Texels(codec));
-        let notes = kept.notes(ids)?;
+    pub fn texels(&self, ids: &[u32], codec: KeptCodec) -> ScratchResult<Tried> {
+        let Made { notes, texels } = self.memo.made(Kind::Texels(codec), ids)?;
         Ok(Tried {
             costs: notes.iter().map(Note::cost).collect(),
-            bytes: kept.texels(ids)?,
+            bytes: texels,
             axes: notes.iter().map(|note| note.word as u8).collect(),
         })
     }
 
     /// What 0 and 1 of a brick's own texels stand for.
     pub fn range(&self, tree: &SequenceTree, id: u32) -> BrickRange {
-        match self.terms.range {
-            RangeMode::Sequence => BrickRange::SEQUENCE,
-            RangeMode::Brick => {
-                let values = tree.brick_ranges[id];
-                self.sequence.fit(values.min, values.max)
-            }
-        }
+        own_range(&self.sequence, self.terms.range, tree.brick_ranges[id])
     }
 
     /// Whether a brick's texels give all of its voxels.
@@ -260,10 +350,6 @@ impl Encodings {
         Measure::new(brick, texel_mask, &self.terms)
     }
 
-    fn kept(&self, kind: Kind) -> &Spilled {
-        &self.kept[kind.index()]
-    }
-
     /// Sees to it that some bricks, ascending, are known in every kind. `advance` hears of those that are done.
     ///
     /// # Errors
@@ -274,17 +360,17 @@ impl Encodings {
         ids: &[u32],
         kinds: &[Kind],
         mut advance: impl FnMut(u64),
-    ) -> io::Result<()> {
+    ) -> Result<()> {
         self.load(tree, ids, kinds)?;
         for window in ids.chunks(BRICKS_IN_FLIGHT as usize) {
-            if interrupt::is_requested() {
+            if self.cancel.is_cancelled() {
                 self.save(tree)?;
-                interrupt::check()?;
             }
+            self.cancel.check()?;
             let missing: Vec<u32> = window
                 .iter()
                 .copied()
-                .filter(|&id| kinds.iter().any(|k| !self.kept(*k).is_known(id)))
+                .filter(|&id| kinds.iter().any(|k| !self.memo.is_known(*k, id)))
                 .collect();
             tree.fetch(&missing)?;
             let shared: &SequenceTree = tree;
@@ -292,14 +378,16 @@ impl Encodings {
             let threads = rayon::current_num_threads();
             let batches = missing.len().div_ceil(BATCH).next_multiple_of(threads).max(threads);
             let batch = missing.len().div_ceil(batches).max(LEAST_BATCH);
-            let made: Vec<io::Result<Vec<Made>>> =
+            let made: Vec<ScratchResult<Vec<Made>>> =
                 missing.par_chunks(batch).map(|ids| self.make_batch(shared, ids, kinds)).collect();
             for (ids, made) in missing.chunks(batch).zip(made) {
-                made?.iter().zip(kinds).try_for_each(|(made, kind)| self.keep(ids, *kind, made))?;
+                made?.iter().zip(kinds).try_for_each(|(made, kind)| self.memo.add(*kind, ids, made))?;
             }
-            self.flush()?;
-            for &kind in kinds {
-                self.batches.mark(&missing, kind);
+            self.memo.flush()?;
+            if self.earlier.is_some() {
+                let batches = self.batches_of(&missing);
+                let earlier = self.earlier.as_mut().expect("there is one");
+                kinds.iter().for_each(|&kind| earlier.note_made(&batches, kind));
             }
             if self.saved.elapsed() > SAVE_EVERY {
                 self.save(tree)?;
@@ -309,7 +397,7 @@ impl Encodings {
         Ok(())
     }
 
-    fn make_batch(&self, tree: &SequenceTree, ids: &[u32], kinds: &[Kind]) -> io::Result<Vec<Made>> {
+    fn make_batch(&self, tree: &SequenceTree, ids: &[u32], kinds: &[Kind]) -> ScratchResult<Vec<Made>> {
         let _span = profile::span("encode");
         let bricks = &tree.pool.read(ids)?;
         let texels: Vec<Texels> = ids.iter().zip(bricks).map(|(&id, b)| self.prepare(tree, id, b)).collect();
@@ -360,24 +448,38 @@ impl Encodings {
         };
         Made { notes: each.map(note).collect(), texels: encoded.bytes }
     }
+}
 
-    fn keep(&mut self, ids: &[u32], kind: Kind, made: &Made) -> io::Result<()> {
-        self.kept[kind.index()].add(self.rules.len(), ids, made)
+/// What 0 and 1 of the own texels of a brick with these values stand for.
+pub fn own_range(sequence: &SequenceRange, mode: RangeMode, values: ValueRange) -> BrickRange {
+    match mode {
+        RangeMode::Sequence => BrickRange::SEQUENCE,
+        RangeMode::Brick => sequence.fit(values.min, values.max),
     }
+}
 
-    /// Sees to it that what was kept can be read.
-    fn flush(&mut self) -> io::Result<()> {
-        self.kept.iter_mut().try_for_each(Spilled::flush)
+/// The batches of a grid, in the order of its pool.
+fn batches(tree: &SequenceTree) -> Vec<Batch> {
+    let mut all = Vec::new();
+    for (frame, own) in tree.own_bricks.iter().enumerate() {
+        let own: Vec<u32> = own.clone().collect();
+        let part = |id: &u32| tree.pool.place(*id) / BATCH_BRICKS;
+        for ids in own.chunk_by(|a, b| part(a) == part(b)) {
+            all.push(Batch { frame, part: part(&ids[0]), ids: ids[0]..ids[ids.len() - 1] + 1 });
+        }
     }
+    all
 }
 
 /// What was made of some bricks in a kind, one brick after another.
 #[derive(Default, Serialize, Deserialize)]
-struct Made {
+pub struct Made {
+    /// [`Kind::notes`] a brick.
     #[serde(with = "pods")]
-    notes: Vec<Note>,
+    pub notes: Vec<Note>,
+    /// [`Kind::texels`] a brick.
     #[serde(with = "pods")]
-    texels: Vec<u8>,
+    pub texels: Vec<u8>,
 }
 
 /// What a codec made of some bricks.

@@ -1,27 +1,28 @@
 //! What was made of bricks: where it lies in memory, the rest in scratch files.
 
-use std::io;
-
 use bytemuck::{Pod, Zeroable};
 
 use super::{Cost, KeptCodec, Kind, Made};
-use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder};
+use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder, ScratchResult};
 
 /// A [`Cost`], and something more of what it is the cost of.
 #[derive(Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
-pub(super) struct Note {
+pub struct Note {
     error_l2: f64,
     active_error_l2: f64,
     max: f32,
+    /// What depends on the kind: a constant's value, a packing axis.
     pub word: u32,
 }
 
 impl Note {
+    /// The note of a cost.
     pub fn new(cost: Cost, word: u32) -> Self {
         Self { error_l2: cost.error_l2, active_error_l2: cost.active_error_l2, max: cost.max, word }
     }
 
+    /// The cost.
     pub fn cost(&self) -> Cost {
         Cost { error_l2: self.error_l2, active_error_l2: self.active_error_l2, max: self.max }
     }
@@ -106,7 +107,7 @@ impl Spilled {
     }
 
     /// Keeps what was made of some bricks of a pool of `bricks`.
-    pub fn add(&mut self, bricks: usize, ids: &[u32], made: &Made) -> io::Result<()> {
+    pub fn add(&mut self, bricks: usize, ids: &[u32], made: &Made) -> ScratchResult<()> {
         let places: Vec<u32> = ids.iter().map(|&id| self.places.take(bricks, id)).collect();
         let (mut notes, mut texels) = (bytemuck::cast_slice(&made.notes), &made.texels[..]);
         let put = |scratch: &mut Scratch, places: &[u32], records: &mut &[u8]| {
@@ -122,7 +123,7 @@ impl Spilled {
     }
 
     /// Sees to it that what was added can be read.
-    pub fn flush(&mut self) -> io::Result<()> {
+    pub fn flush(&mut self) -> ScratchResult<()> {
         self.notes.flush()?;
         self.texels.as_mut().map_or(Ok(()), Scratch::flush)
     }
@@ -132,7 +133,7 @@ impl Spilled {
     }
 
     /// The notes of bricks that are known, one after another.
-    pub fn notes(&self, ids: &[u32]) -> io::Result<Vec<Note>> {
+    pub fn notes(&self, ids: &[u32]) -> ScratchResult<Vec<Note>> {
         let each = self.notes.record() / size_of::<Note>();
         let mut notes = vec![Note::zeroed(); ids.len() * each];
         let mut next = notes.chunks_exact_mut(each);
@@ -143,7 +144,7 @@ impl Spilled {
     }
 
     /// The texels of bricks that are known, one after another.
-    pub fn texels(&self, ids: &[u32]) -> io::Result<Vec<u8>> {
+    pub fn texels(&self, ids: &[u32]) -> ScratchResult<Vec<u8>> {
         let mut texels = Vec::new();
         if let Some(scratch) = &self.texels {
             texels.reserve(ids.len() * scratch.record());
