@@ -4,6 +4,7 @@ use std::error::Error;
 use std::path::PathBuf;
 
 use serde_json::json;
+use volpack::cancel::CancelToken;
 use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::render::Device;
@@ -43,7 +44,8 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             build(&job, &mut Silent)?;
             let pack = Pack::open(&job.output)?;
             let settings = PictureSettings { device: args.device, ..PictureSettings::default() };
-            let report = pictures(&pack, &Sources::find(&pack, &frames)?, &settings)?;
+            let report =
+                pictures(&pack, &Sources::find(&pack, &frames)?, &settings, &CancelToken::default())?;
             let worst = report.pictures.iter().max_by(|a, b| a.source.flip.total_cmp(&b.source.flip));
             let worst = worst.ok_or("no pictures")?.source;
             let psnr = worst.psnr.map_or("same".to_owned(), |db| format!("{db:.1} dB"));
