@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 
 use common::{build_verified, gpu};
 use vdb_writer::{GridFile, write_grid};
+use volpack::cancel::CancelToken;
 use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::render::{
@@ -53,7 +54,7 @@ fn built(frames: &[PathBuf], settings: Settings, folder: &Path) -> Pack {
 
 fn ring(pack: &Pack, frames: &[PathBuf]) -> PicturesReport {
     let settings = PictureSettings { device: Device::Cpu, ..PictureSettings::default() };
-    pictures(pack, &Sources::find(pack, frames).unwrap(), &settings).unwrap()
+    pictures(pack, &Sources::find(pack, frames).unwrap(), &settings, &CancelToken::default()).unwrap()
 }
 
 fn field(pack: &Pack, frame: usize) -> DecodedFrame {
