@@ -8,7 +8,7 @@ use std::time::Instant;
 
 use serde_json::json;
 
-use crate::peers;
+use crate::peer_programs;
 use crate::process_stats::median;
 
 #[derive(clap::Args)]
@@ -20,7 +20,7 @@ pub struct Args {
     #[arg(long, default_value_t = 9)]
     rounds: usize,
     /// The volpack to run
-    #[arg(long, default_value_os_t = peers::volpack())]
+    #[arg(long, default_value_os_t = peer_programs::volpack())]
     volpack: PathBuf,
     /// Write the raw figures here too
     #[arg(long)]
@@ -193,7 +193,7 @@ fn run(
 
 /// An edit that leaves no brick as it was: every value times 0.97.
 fn edit(from: &Path, to: &Path) -> Result<(), Box<dyn Error>> {
-    let program = peers::compile_openvdb("benches/peers/scale_openvdb.cpp")?;
+    let program = peer_programs::compile_openvdb("benches/peers/scale_openvdb.cpp")?;
     let status = Command::new(program).arg(from).arg(to).arg("0.97").status()?;
     if status.success() { Ok(()) } else { Err("the frame could not be edited".into()) }
 }

@@ -9,7 +9,7 @@ use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::settings::{Clustering, Format, Settings};
 
-use crate::{peers, sequence};
+use crate::{peer_programs, sequence};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -67,5 +67,5 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 "before": before, "after": after, "rmse": rmse, "rmse_without": alone, "psnr": psnr }));
         }
     }
-    peers::write(args.json.as_deref(), &json!(rows))
+    peer_programs::write(args.json.as_deref(), &json!(rows))
 }

@@ -289,7 +289,7 @@ mod tests {
 
     #[test]
     fn no_good_pack_of_the_fixtures_is_refused() {
-        let fixtures = crate::peers::root().join("fixtures");
+        let fixtures = crate::peer_programs::root().join("fixtures");
         run(&Args { folders: vec![fixtures], no_pictures: true, json: None }).unwrap();
     }
 }

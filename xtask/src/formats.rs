@@ -12,7 +12,7 @@ use volpack::report::PackSummary;
 use volpack::settings::{Format, Quality, RangeMode, Settings};
 use volpack::verify::VerifyReport;
 
-use crate::{peers, sequence};
+use crate::{peer_programs, sequence};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -80,7 +80,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 "active": report.active, "all": report.all, "peak": grid.peak, "failures": report.failures.len() }));
         }
     }
-    peers::write(args.json.as_deref(), &json!(rows))
+    peer_programs::write(args.json.as_deref(), &json!(rows))
 }
 
 fn ways() -> Vec<Way> {

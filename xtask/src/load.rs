@@ -11,7 +11,7 @@ use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::settings::{Format, Quality, Settings};
 use volpack::vdb::VdbFile;
 
-use crate::peers;
+use crate::peer_programs;
 use crate::process_stats::median;
 use crate::scale::Sequences;
 
@@ -78,7 +78,10 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 "gpu_bytes": gpu_bytes, "whole": whole, "open": open, "frame": one, "vdb": vdb }));
         }
     }
-    peers::write(args.json.as_deref(), &json!({ "threads": rayon::current_num_threads(), "rows": rows }))
+    peer_programs::write(
+        args.json.as_deref(),
+        &json!({ "threads": rayon::current_num_threads(), "rows": rows }),
+    )
 }
 
 /// Everything that a GPU is given: the tree and each slab of each atlas, checked and unpacked.

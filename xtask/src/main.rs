@@ -3,7 +3,6 @@
 //! `cargo run --release -p xtask -- help` lists the tasks. None of them is part of the tests: they need
 //! peers from Debian (`libopenvdb-dev libboost-dev libtbb-dev libimath-dev g++`) or volumes of your own.
 
-mod beside;
 mod cache;
 mod clusters;
 mod corpus;
@@ -13,6 +12,7 @@ mod load;
 mod mutate;
 mod openvdb;
 mod pages;
+mod peer_programs;
 mod peers;
 mod pictures;
 mod process_stats;
@@ -75,7 +75,7 @@ enum Bench {
     /// A long sequence beside a short one: time, memory, cores in use
     Scale(scale::Args),
     /// Whole builds beside NanoVDB's converter, the BC7 stage beside its encoder, files beside zstd
-    Peers(beside::Args),
+    Peers(peers::Args),
     /// From a pack in the page cache to the bytes that a GPU is given, beside reading the .vdb
     Load(load::Args),
     /// Every format and range on each volume: bytes, PSNR, largest error, seconds; and the tree beside
@@ -101,7 +101,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         Task::Bench(Bench::Read(args)) => read::bench(&args),
         Task::Bench(Bench::Cache(args)) => cache::bench(&args),
         Task::Bench(Bench::Scale(args)) => scale::bench(&args),
-        Task::Bench(Bench::Peers(args)) => beside::bench(&args),
+        Task::Bench(Bench::Peers(args)) => peers::bench(&args),
         Task::Bench(Bench::Load(args)) => load::bench(&args),
         Task::Bench(Bench::Formats(args)) => formats::bench(&args),
         Task::Bench(Bench::Clusters(args)) => clusters::bench(&args),

@@ -10,7 +10,7 @@ use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::peers::root;
+use crate::peer_programs::root;
 
 #[derive(clap::Args)]
 pub struct Args {

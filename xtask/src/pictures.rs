@@ -10,7 +10,7 @@ use volpack::render::Device;
 use volpack::settings::{Format, Settings};
 use volpack::verify::{PictureSettings, Sources, pictures};
 
-use crate::{peers, sequence};
+use crate::{peer_programs, sequence};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -51,5 +51,5 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             rows.push(json!({ "volume": name, "format": format, "flip": worst.flip, "psnr": worst.psnr, "rmse": worst.rmse }));
         }
     }
-    peers::write(args.json.as_deref(), &json!(rows))
+    peer_programs::write(args.json.as_deref(), &json!(rows))
 }

@@ -8,7 +8,7 @@ use std::time::Instant;
 use serde_json::{Value as Json, json};
 use volpack::vdb::{VdbFile, with_scalar_type};
 
-use crate::peers;
+use crate::peer_programs;
 use crate::process_stats::median;
 
 #[derive(clap::Args)]
@@ -70,7 +70,7 @@ fn peak_rss_kib() -> Result<u64, Box<dyn Error>> {
 
 /// Runs both sides in turns and prints the ratio of their medians.
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
-    let theirs = peers::compile_openvdb("benches/peers/read_openvdb.cpp")?;
+    let theirs = peer_programs::compile_openvdb("benches/peers/read_openvdb.cpp")?;
     let ours = std::env::current_exe()?;
     let mut rows = Vec::new();
     println!("| files | OpenVDB ms | volpack ms | ratio | OpenVDB peak MiB | volpack peak MiB | ratio |");

@@ -6,7 +6,7 @@ use std::process::Command;
 
 use serde_json::json;
 
-use crate::peers;
+use crate::peer_programs;
 use crate::process_stats::{self, median};
 
 #[derive(clap::Args)]
@@ -17,7 +17,7 @@ pub struct Args {
     #[arg(long, default_value_t = 5)]
     rounds: usize,
     /// The volpack to run
-    #[arg(long, default_value_os_t = peers::volpack())]
+    #[arg(long, default_value_os_t = peer_programs::volpack())]
     volpack: PathBuf,
     /// Write the raw figures here too
     #[arg(long)]
@@ -84,7 +84,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
         );
         rows.push(json!({ "build": options, "short": shorts, "long": longs }));
     }
-    peers::write(
+    peer_programs::write(
         args.json.as_deref(),
         &json!({ "frames": [short.len(), long.len()], "cores": cores, "rows": rows }),
     )
@@ -109,7 +109,7 @@ impl Sequences {
     /// When OpenVDB is not installed.
     pub fn make(&self, folder: &Path) -> Result<(Vec<PathBuf>, usize), Box<dyn Error>> {
         let files = volpack::manifest::expand(&self.files)?;
-        let program = peers::compile_openvdb("benches/peers/repeat_openvdb.cpp")?;
+        let program = peer_programs::compile_openvdb("benches/peers/repeat_openvdb.cpp")?;
         let frames = folder.join("frames");
         std::fs::create_dir(&frames)?;
         let status =

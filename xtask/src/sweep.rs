@@ -4,7 +4,7 @@ use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::peers;
+use crate::peer_programs;
 use crate::sequence;
 
 #[derive(clap::Args)]
@@ -25,10 +25,10 @@ pub struct Args {
     #[arg(long, default_value_t = 2)]
     threads: usize,
     /// The volpack to run
-    #[arg(long, default_value_os_t = peers::volpack())]
+    #[arg(long, default_value_os_t = peer_programs::volpack())]
     volpack: PathBuf,
     /// Draw the charts below this folder, in charts/ and runs/
-    #[arg(long, default_value_os_t = peers::root().join("docs/benchmarks"))]
+    #[arg(long, default_value_os_t = peer_programs::root().join("docs/benchmarks"))]
     output: PathBuf,
 }
 

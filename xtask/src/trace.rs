@@ -15,8 +15,8 @@ use volpack::settings::{Format, Settings};
 use volpack::sweep::nanovdb::{self, Quantise};
 use volpack::sweep::{Steady, steady};
 
-use crate::beside::TOLERANCE;
-use crate::peers;
+use crate::peer_programs;
+use crate::peers::TOLERANCE;
 use crate::process_stats::median;
 
 #[derive(clap::Args)]
@@ -66,7 +66,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     for path in &args.files {
         bench.volume(path)?;
     }
-    peers::write(args.json.as_deref(), &json!({ "device": gpu.name, "rows": bench.rows }))
+    peer_programs::write(args.json.as_deref(), &json!({ "device": gpu.name, "rows": bench.rows }))
 }
 
 /// A compiled tracer of NanoVDB's.
@@ -77,7 +77,7 @@ struct Peer {
 
 fn peers(args: &Args) -> Result<Vec<Peer>, Box<dyn Error>> {
     let compile =
-        |headers| peers::compile_nanovdb(headers).map(|(program, version)| Peer { program, version });
+        |headers| peer_programs::compile_nanovdb(headers).map(|(program, version)| Peer { program, version });
     if args.nanovdb.is_empty() {
         return Ok(vec![compile(None)?]);
     }
