@@ -1,4 +1,4 @@
-//! Compiles the small C++ programs that run a peer's own code.
+//! Compiles the small C++ and CUDA programs that run OpenVDB's and NanoVDB's code, and finds files of the repository.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ pub fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask lies in the repository")
 }
 
-/// Compiles a program against OpenVDB into `target/peers` and returns where it is.
+/// Compiles a program against OpenVDB into `target/peers` and returns its path.
 ///
 /// # Errors
 /// When there is no compiler or no OpenVDB: the message says what to install.
@@ -36,7 +36,7 @@ pub fn compile_openvdb(source: &str) -> Result<PathBuf, Box<dyn Error>> {
     }
 }
 
-/// Writes raw figures where they are asked for.
+/// Writes raw figures to a JSON file, if a path is given.
 ///
 /// # Errors
 /// When the file cannot be written.
@@ -44,8 +44,8 @@ pub fn write(path: Option<&Path>, figures: &serde_json::Value) -> Result<(), Box
     path.map_or(Ok(()), |path| Ok(std::fs::write(path, serde_json::to_string(figures)?)?))
 }
 
-/// Compiles `benches/peers/nanovdb_trace.cu` for the GPU that is there, into `target/peers`, with the NanoVDB below a folder, or
-/// with the compiler's own. Returns the program and NanoVDB's version.
+/// Compiles `benches/peers/nanovdb_trace.cu` for the GPU of this machine into `target/peers`, with the NanoVDB headers of a folder,
+/// or with those on the compiler's path. Returns the program and NanoVDB's version.
 ///
 /// # Errors
 /// When there is no CUDA compiler or no NanoVDB: the message says what to install.
@@ -63,14 +63,14 @@ pub fn compile_nanovdb(headers: Option<&Path>) -> Result<(PathBuf, String), Box<
         return Err("nvcc or NanoVDB is not installed: the CUDA toolkit, and apt-get install libnanovdb-dev libnanovdb-tools"
             .into());
     }
-    // Without arguments it prints its version and no more.
+    // Without arguments, it prints only its version.
     let version = String::from_utf8(Command::new(&fresh).output()?.stdout)?.trim().to_owned();
     let program = folder.join(format!("nanovdb_trace-{version}"));
     std::fs::rename(&fresh, &program)?;
     Ok((program, version))
 }
 
-/// The volpack that was built with this.
+/// The release binary of volpack in this repository.
 pub fn volpack() -> PathBuf {
     root().join("target/release/volpack")
 }

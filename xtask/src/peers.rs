@@ -1,4 +1,4 @@
-//! Whole builds beside NanoVDB's converter, our BC7 stage beside the encoder in it, and files beside the sources and zstd.
+//! Compares whole builds with NanoVDB's converter, our BC7 stage with the encoder that it calls, and file sizes with the sources and zstd.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -21,24 +21,24 @@ use crate::process_stats::{self, Run, median};
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// The frames of one sequence of floats
+    /// Files of one sequence of float grids
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// How often each side is measured, in turns; the median counts
+    /// Number of runs of each program, in turns; the median is printed
     #[arg(long, default_value_t = 9)]
     rounds: usize,
-    /// The volpack to run
+    /// Path of the volpack binary to run
     #[arg(long, default_value_os_t = peer_programs::volpack())]
     volpack: PathBuf,
-    /// The grid
+    /// Name of the grid to use
     #[arg(long, default_value = "density")]
     grid: String,
-    /// Write the raw figures here too
+    /// Also write the raw figures to this JSON file
     #[arg(long)]
     json: Option<PathBuf>,
 }
 
-/// What `nanovdb_convert --fpN` takes for fog where no tolerance is given.
+/// Default tolerance of `nanovdb_convert --fpN` for fog.
 pub const TOLERANCE: f64 = 0.01;
 
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
@@ -48,18 +48,20 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     if nanovdb::is_installed() {
         figures["builds"] = builds(args, &files, folder.path())?;
     } else {
-        println!("NanoVDB is not installed, whole builds are left out: apt-get install libnanovdb-tools");
+        println!(
+            "NanoVDB is not installed, so whole builds are not measured: apt-get install libnanovdb-tools"
+        );
     }
     figures["bc7"] = blocks(&files, args)?;
-    println!("\nReading .vdb files beside OpenVDB: `xtask bench read`");
+    println!("\nTo compare reading .vdb files with OpenVDB: `xtask bench read`");
     peer_programs::write(args.json.as_deref(), &figures)
 }
 
 /// One way to convert a sequence.
 struct Side {
     name: &'static str,
-    /// The place of the peer that it is compared with, and what it may take of its time.
-    beside: Option<(usize, f64)>,
+    /// Index of the peer that it is compared with, and the limit of its time divided by the peer's.
+    peer: Option<(usize, f64)>,
     runs: Vec<Run>,
     bytes: u64,
     psnr: Option<f64>,
@@ -77,7 +79,7 @@ fn builds(args: &Args, files: &[PathBuf], folder: &Path) -> Result<Json, Box<dyn
         let grid = [&["-g", &args.grid], options].concat();
         process_stats::build(&args.volpack, &grid, files, &pack)
     };
-    let side = |name, beside| Side { name, beside, runs: Vec::new(), bytes: 0, psnr: None };
+    let side = |name, peer| Side { name, peer, runs: Vec::new(), bytes: 0, psnr: None };
     let mut sides = [
         (side("nanovdb_convert --fp8", None), convert(&["--fp8"])),
         (side("nanovdb_convert --fpN", None), convert(&["--fpN", "-a", &tolerance])),
@@ -89,7 +91,7 @@ fn builds(args: &Args, files: &[PathBuf], folder: &Path) -> Result<Json, Box<dyn
         for (side, command) in &mut sides {
             side.runs.push(process_stats::run(command)?);
             if round == 0 {
-                side.bytes = if side.beside.is_some() { &pack } else { &nvdb }.metadata()?.len();
+                side.bytes = if side.peer.is_some() { &pack } else { &nvdb }.metadata()?.len();
             }
         }
     }
@@ -101,13 +103,13 @@ fn builds(args: &Args, files: &[PathBuf], folder: &Path) -> Result<Json, Box<dyn
         sides[i].0.psnr = their_psnr(args, files, quantise, peak, folder)?;
     }
     println!(
-        "| {} frames | ms | of its peer's | limit | peak MiB | file MB | of its peer's | PSNR dB |",
+        "| {} frames | ms | time / peer's | limit | peak MiB | file MB | size / peer's | PSNR dB |",
         files.len()
     );
     println!("|---|---|---|---|---|---|---|---|");
     for (side, _) in &sides {
         let seconds = median(side.runs.iter().map(|run| run.seconds));
-        let peer = side.beside.map(|(peer, limit)| (&sides[peer].0, limit));
+        let peer = side.peer.map(|(peer, limit)| (&sides[peer].0, limit));
         let [time, limit, bytes] = peer.map_or_else(Default::default, |(peer, limit)| {
             let time = seconds / median(peer.runs.iter().map(|run| run.seconds));
             let verdict = if time <= limit { "met" } else { "**missed**" };
@@ -128,17 +130,17 @@ fn builds(args: &Args, files: &[PathBuf], folder: &Path) -> Result<Json, Box<dyn
     Ok(json!({ "sides": sides.iter().map(row).collect::<Vec<_>>(), "on_disk": on_disk }))
 }
 
-/// The peak, and PSNRs against it; none where a build is exact.
+/// The peak value, and the PSNR of each build against it; `None` if the build is exact.
 type Psnrs = (f64, Vec<Option<f64>>);
 
-/// What each of our builds has.
+/// Builds with each of our formats and returns the PSNRs.
 fn our_psnrs(args: &Args, files: &[PathBuf], pack: &Path) -> Result<Psnrs, Box<dyn Error>> {
     let (mut peak, mut psnrs) = (0.0, Vec::new());
     for format in [Format::F16, Format::Unorm8, Format::Adaptive] {
         let quality = Quality::Psnr(45.0);
         let settings = Settings { format, grids: vec![args.grid.clone()], quality, ..Settings::default() };
         let job = Job::new(files.to_vec(), pack.to_owned(), settings, VerifyLevel::Voxels);
-        let report = build(&job, &mut Silent)?.verification.ok_or("it was verified")?;
+        let report = build(&job, &mut Silent)?.verification.ok_or("the build returned no verification")?;
         peak = report.grids[0].peak;
         psnrs.push(report.grids[0].active.psnr);
     }
@@ -162,26 +164,28 @@ fn their_psnr(
     Ok(error.psnr(peak))
 }
 
-/// What lies on the disk: the sources, NanoVDB's file packed as hard as is usual, and ours.
+/// Prints file sizes: the sources, NanoVDB's file compressed with zstd -19, and our pack.
 fn on_disk(files: &[PathBuf], nvdb: &Path, ours: u64) -> Result<Json, Box<dyn Error>> {
     let sources: u64 = files.iter().map(|file| Ok(file.metadata()?.len())).sum::<std::io::Result<u64>>()?;
-    println!("\n| on the disk | MB |\n|---|---|");
-    println!("| the sources | {:.2} |", sources as f64 / 1e6);
+    println!("\n| file size | MB |\n|---|---|");
+    println!("| sources | {:.2} |", sources as f64 / 1e6);
     println!("| volpack adaptive, 45 dB | {:.2} |", ours as f64 / 1e6);
-    // The last of the peers' builds but one was fpN.
+    // `nvdb` has the output of the last converter run, which was --fpN.
     let packed = Command::new("zstd").args(["-19", "-q", "-c"]).arg(nvdb).stderr(Stdio::null()).output();
     let packed = packed.ok().filter(|output| output.status.success()).map(|output| output.stdout.len());
     match packed {
         Some(bytes) => println!("| nanovdb_convert --fpN, then zstd -19 | {:.2} |", bytes as f64 / 1e6),
-        None => println!("zstd is not installed, the packed .nvdb is left out: apt-get install zstd"),
+        None => {
+            println!("zstd is not installed, so the compressed .nvdb is not measured: apt-get install zstd")
+        }
     }
     Ok(json!({ "sources": sources, "ours": ours, "fpn_zstd_19": packed }))
 }
 
-/// What our BC7 stage may take of the raw encoder's time on the same texels.
+/// Minimum throughput of our BC7 stage, as a fraction of the encoder's alone on the same texels.
 const LEAST_THROUGHPUT: f64 = 0.8;
 
-/// Our BC7 encoder, which tries three packing axes and keeps the best, beside three calls of the encoder in it.
+/// Compares our BC7 stage, which tries three packing axes and uses the best, with three calls of the encoder alone.
 fn blocks(files: &[PathBuf], args: &Args) -> Result<Json, Box<dyn Error>> {
     let sequence = SequenceRange::around(0.0, 1.0).ok_or("a range")?;
     let mut bricks: Vec<Texels> = Vec::new();
@@ -193,7 +197,7 @@ fn blocks(files: &[PathBuf], args: &Args) -> Result<Json, Box<dyn Error>> {
             let values = *tree.leaves.values(leaf);
             let range = ValueRange::union_all(values.iter().copied().map(ValueRange::of)).ok_or("values")?;
             if range.width() > 0.0 {
-                // Stretched to 0..1, as a range of its own does it.
+                // Normalised to 0..1, as a brick range does.
                 let values = values.map(|v| (v - range.min) / (range.max - range.min));
                 bricks.push(Texels { values, texel_mask: Mask512::ALL, range: BrickRange::SEQUENCE });
             }
@@ -217,7 +221,7 @@ fn blocks(files: &[PathBuf], args: &Args) -> Result<Json, Box<dyn Error>> {
         let start = Instant::now();
         let encoded = encode(Codec::Bc7, &sequence, &bricks)?;
         ours.push(start.elapsed().as_secs_f64());
-        // Each of three axes has as many blocks as the one that is kept.
+        // Each of the three axes has as many blocks as the chosen one.
         assert!(blocks >= 3 * encoded.bytes.len(), "both sides encode the same texels");
     }
     let middle = |seconds: &[f64]| {
@@ -239,10 +243,10 @@ fn blocks(files: &[PathBuf], args: &Args) -> Result<Json, Box<dyn Error>> {
     Ok(json!({ "bricks": bricks.len(), "raw": raw, "ours": ours }))
 }
 
-/// Bricks side by side, 16 texels each, with four neighbours along an axis in the channels.
+/// An RGBA surface with bricks next to each other, 16 texels each, and four neighbours along an axis in the channels.
 fn surface(batch: &[Texels], axis: usize) -> Vec<u8> {
     let strides = [[64, 1, 8], [8, 1, 64], [1, 8, 64]][axis];
-    // The encoder wants 64 texels of width.
+    // The encoder needs a width of at least 64 texels.
     let width = (16 * batch.len()).max(64);
     let mut data = vec![0; width * 8 * 4];
     for (b, brick) in batch.iter().enumerate() {
