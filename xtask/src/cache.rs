@@ -1,4 +1,4 @@
-//! What a build costs with a cache: cold, and after each kind of change.
+//! Measures builds with a cache: cold, and after each kind of change.
 
 use std::error::Error;
 use std::fs;
@@ -8,26 +8,26 @@ use std::time::Instant;
 
 use serde_json::json;
 
-use crate::peers;
+use crate::peer_programs;
 use crate::process_stats::median;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// The frames of one sequence
+    /// Files of one sequence
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// How often each build is timed; the median counts
+    /// Number of runs of each build; the median is printed
     #[arg(long, default_value_t = 9)]
     rounds: usize,
-    /// The volpack to run
-    #[arg(long, default_value_os_t = peers::volpack())]
+    /// Path of the volpack binary to run
+    #[arg(long, default_value_os_t = peer_programs::volpack())]
     volpack: PathBuf,
-    /// Write the raw figures here too
+    /// Also write the raw figures to this JSON file
     #[arg(long)]
     json: Option<PathBuf>,
 }
 
-/// What is asked of a build and what it may take of a cold one.
+/// One kind of build, and the limit of its time as a fraction of a cold build.
 struct Case {
     name: &'static str,
     options: &'static [&'static str],
@@ -39,18 +39,18 @@ struct Case {
 #[derive(Clone, Copy, PartialEq)]
 enum Frames {
     Source,
-    /// The middle one is edited after the build before.
+    /// The middle frame is edited after the previous build.
     Edited,
 }
 
-/// What is there when a build begins.
+/// State of the cache when a build begins.
 #[derive(Clone, Copy, PartialEq)]
 enum Start {
-    /// Nothing, and nothing is kept.
+    /// No cache.
     NoCache,
     /// An empty cache.
     Empty,
-    /// What a build left behind, and its pack.
+    /// The cache and the pack of an earlier build with these options.
     After(&'static [&'static str]),
 }
 
@@ -80,7 +80,7 @@ fn cases() -> Vec<Case> {
     ]
 }
 
-/// A bound of its own for a build that finds nothing to do, in seconds.
+/// Absolute time limit of a build without a change, in seconds.
 const INSTANT: f64 = 0.15;
 
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
@@ -94,7 +94,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     let middle = &files[files.len() / 2];
     let in_place = source.join(middle.file_name().ok_or("a file has a name")?);
     edit(middle, &edited)?;
-    // Files that were changed this moment are not taken to be unchanged.
+    // volpack hashes files again that changed less than two seconds ago.
     std::thread::sleep(std::time::Duration::from_secs(3));
 
     let cases = cases();
@@ -138,7 +138,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
 }
 
 fn print(cases: &[Case], seconds: &[Vec<f64>]) {
-    println!("| build | ms | of cold | limit | of no cache |\n|---|---|---|---|---|");
+    println!("| build | ms | time / cold | limit | time / no cache |\n|---|---|---|---|---|");
     let uncached = median(seconds[0].iter().copied());
     let mut cold = uncached;
     for (case, seconds) in cases.iter().zip(seconds) {
@@ -161,13 +161,13 @@ fn print(cases: &[Case], seconds: &[Vec<f64>]) {
     }
 }
 
-/// A build with a cache makes what one without it makes.
+/// Checks that a build with a cache writes the same pack as a build without one.
 fn check(args: &Args, case: &Case, frames: &Path, folder: &Path) -> Result<(), Box<dyn Error>> {
     let alone = folder.join("alone");
     fs::create_dir(&alone)?;
     run(args, frames, &alone, case.options, false)?;
     if fs::read(folder.join("out.volpack"))? != fs::read(alone.join("out.volpack"))? {
-        return Err(format!("{}: the pack is not what a build without a cache makes", case.name).into());
+        return Err(format!("{}: the pack differs from that of a build without a cache", case.name).into());
     }
     Ok(())
 }
@@ -191,9 +191,9 @@ fn run(
     if status.success() { Ok(()) } else { Err(format!("{command:?}: {status}").into()) }
 }
 
-/// An edit that leaves no brick as it was: every value times 0.97.
+/// Edits a frame so that every brick changes: every value is multiplied by 0.97.
 fn edit(from: &Path, to: &Path) -> Result<(), Box<dyn Error>> {
-    let program = peers::compile_openvdb("benches/peers/scale_openvdb.cpp")?;
+    let program = peer_programs::compile_openvdb("benches/peers/scale_openvdb.cpp")?;
     let status = Command::new(program).arg(from).arg(to).arg("0.97").status()?;
     if status.success() { Ok(()) } else { Err("the frame could not be edited".into()) }
 }

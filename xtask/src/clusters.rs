@@ -1,4 +1,4 @@
-//! What clustering gives and costs: the columns of the thesis's figure 19.
+//! Measures k-means clustering: bricks saved, and error. The columns are those of the thesis's figure 19.
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -9,14 +9,14 @@ use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::settings::{Clustering, Format, Settings};
 
-use crate::{peers, sequence};
+use crate::{peer_programs, sequence};
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Sequences: a file or a glob each
+    /// Sequences, each a file or a glob
     #[arg(required = true)]
     sequences: Vec<PathBuf>,
-    /// Write the raw figures here too
+    /// Also write the raw figures to this JSON file
     #[arg(long)]
     json: Option<PathBuf>,
 }
@@ -50,7 +50,8 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 Settings { format: Format::Bc7, clustering, ..Settings::default() },
                 VerifyLevel::Voxels,
             );
-            let report = build(&job, &mut Silent)?.verification.ok_or("it was verified")?;
+            let report =
+                build(&job, &mut Silent)?.verification.ok_or("the build returned no verification")?;
             let bricks = Pack::open(&job.output)?.atlas(Codec::Bc7).map_or(0, |a| a.bricks);
             let grid = &report.grids[0];
             Ok((bricks, grid.active.rmse / grid.peak, grid.active.psnr.unwrap_or(f64::INFINITY)))
@@ -67,5 +68,5 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 "before": before, "after": after, "rmse": rmse, "rmse_without": alone, "psnr": psnr }));
         }
     }
-    peers::write(args.json.as_deref(), &json!(rows))
+    peer_programs::write(args.json.as_deref(), &json!(rows))
 }

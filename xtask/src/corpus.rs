@@ -1,5 +1,5 @@
-//! Every sequence below some folders, packed in every way and verified: no good pack is refused, and none goes unnoticed
-//! that is not. Run before each release on all real files there are.
+//! Builds and verifies every sequence below the given folders with every setting, to find good packs that are refused and
+//! bad packs that pass. Run it before each release on all real files.
 
 use std::collections::BTreeSet;
 use std::error::Error;
@@ -21,10 +21,10 @@ pub struct Args {
     /// Folders with OpenVDB files
     #[arg(required = true)]
     folders: Vec<PathBuf>,
-    /// Compare voxels alone, not pictures
+    /// Verify voxels only, not pictures
     #[arg(long)]
     no_pictures: bool,
-    /// Write the raw figures here too
+    /// Also write the raw figures to this JSON file
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
 }
@@ -42,7 +42,7 @@ enum End {
         gpu_bytes: u64,
         psnr: Option<f64>,
     },
-    /// With why, and why that is right, if it is.
+    /// The message, and the reason why the refusal is correct, if there is one.
     Refused {
         why: String,
         right_since: Option<&'static str>,
@@ -76,7 +76,7 @@ pub fn run(args: &Args) -> Result<(), Box<dyn Error>> {
             }
             Err(why) => {
                 let right_since = (volpack::cli::exit_code::of(&why) == 6)
-                    .then_some("nothing in it is of a kind that is packed");
+                    .then_some("no grid has a supported type");
                 let end = End::Refused { why: why.to_string(), right_since };
                 rows.push(Row {
                     sequence: name,
@@ -94,7 +94,10 @@ pub fn run(args: &Args) -> Result<(), Box<dyn Error>> {
     }
     let wrong = rows.iter().filter(|row| matches!(&row.end, End::Refused { right_since: None, .. })).count();
     if wrong > 0 {
-        Err(format!("{wrong} builds were refused for no reason that is known to be right").into())
+        Err(format!(
+            "{wrong} builds were refused without a known reason: see the rows with \"no known reason\""
+        )
+        .into())
     } else {
         Ok(())
     }
@@ -114,7 +117,7 @@ fn find(folder: &Path, out: &mut Vec<PathBuf>) -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// The grids of any frame that can be packed, and have something in them.
+/// The grids of any frame that can be packed.
 fn grids(sequence: &Sequence) -> Result<Vec<Grid>, VolpackError> {
     let mut grids: Vec<Grid> = Vec::new();
     let mut seen = BTreeSet::new();
@@ -137,7 +140,7 @@ fn grids(sequence: &Sequence) -> Result<Vec<Grid>, VolpackError> {
     }
 }
 
-/// What every grid is packed at: what is asked for, and its name.
+/// The settings for every grid, with their names.
 fn settings(half_of_default: Option<u64>) -> Vec<(String, Settings)> {
     let quality = |name: String, quality| (name, Settings { quality, ..Settings::default() });
     let mut all = Vec::new();
@@ -147,7 +150,7 @@ fn settings(half_of_default: Option<u64>) -> Vec<(String, Settings)> {
             .map(|part| quality(format!("max_error {part}"), Quality::MaxError(ErrorBound::of_range(part)))),
     );
     all.extend(half_of_default.map(|size| quality("half the size".to_owned(), Quality::Size(size))));
-    all.push(quality("1 bit a voxel".to_owned(), Quality::BitsPerVoxel(1.0)));
+    all.push(quality("1 bit per voxel".to_owned(), Quality::BitsPerVoxel(1.0)));
     let uniform = Format::ALL.into_iter().filter(|format| format.codec().is_some());
     all.extend(uniform.map(|format| (format.name().to_owned(), Settings { format, ..Settings::default() })));
     all
@@ -161,7 +164,7 @@ fn pack_grid(
     scratch: &Path,
     rows: &mut Vec<Row>,
 ) -> Result<(), Box<dyn Error>> {
-    // One cache a grid: what settings have in common is made once.
+    // One cache per grid, so work that settings share is done once.
     let folder = tempfile::tempdir_in(scratch)?;
     let cache = Arc::new(Cache::open(&folder.path().join("cache"))?);
     let verify = if args.no_pictures { VerifyLevel::Voxels } else { VerifyLevel::All };
@@ -202,17 +205,17 @@ fn end(job: &Job, grid: &Grid) -> End {
         }
         Some(report) => {
             let why = report.failures.join("; ");
-            // Every single failure has to be one that is right.
+            // Every failure needs a known reason.
             let reasons = report.failures.iter().map(|why| reason(job, grid, why));
             let right_since =
                 reasons.collect::<Option<Vec<_>>>().and_then(|reasons| reasons.first().copied());
             End::Refused { why, right_since }
         }
-        None => End::Refused { why: "it was not verified".to_owned(), right_since: None },
+        None => End::Refused { why: "the build returned no verification".to_owned(), right_since: None },
     }
 }
 
-/// Why a refusal is right: the list of what no setting of volpack can pack, or not at what was asked.
+/// The reason why a refusal is correct: a list of what volpack cannot pack at all, or not with the given setting.
 fn reason(job: &Job, grid: &Grid, why: &str) -> Option<&'static str> {
     let format = job.settings.format;
     let is_uniform = format.codec().is_some();
@@ -222,28 +225,28 @@ fn reason(job: &Job, grid: &Grid, why: &str) -> Option<&'static str> {
     let list = [
         (
             asks_for_bytes && why.contains("cannot be reached, the least is"),
-            "below the least size that is possible",
+            "below the smallest possible size",
         ),
         (
             asks_for_bytes && (why.contains("is under 20 dB") || why.contains("the pack has none of its")),
-            "so few bytes leave next to nothing",
+            "too few bytes to represent the grid",
         ),
         (
             is_bytes && grid.class == GridClass::LevelSet && why.contains("flipped"),
-            "a byte or less for each voxel of a level set, the same for all bricks",
+            "a level set in one codec of one byte or less per voxel",
         ),
-        (is_blocks && why.contains("is under 20 dB"), "uniform blocks on steep values"),
-        (is_uniform && grid.is_integer && why.contains("integer"), "one codec that does not keep integers"),
+        (is_blocks && why.contains("is under 20 dB"), "a uniform block format on steep values"),
+        (
+            is_uniform && grid.is_integer && why.contains("integer"),
+            "a uniform codec that does not keep integers",
+        ),
         (
             grid.is_integer && why.contains("no 32-bit float holds"),
-            "integers past 2^24 without integers = \"split\"",
+            "integers above 2^24 without integers = \"split\"",
         ),
-        (
-            why.contains("the background is"),
-            "frames with backgrounds of their own, for which format 1 has no place",
-        ),
-        (format == Format::F16 && why.contains("65504"), "values past what a half holds"),
-        (format == Format::F16 && why.contains("is under 20 dB"), "values below what a half holds"),
+        (why.contains("the background is"), "frames with different backgrounds, which format 1 cannot store"),
+        (format == Format::F16 && why.contains("65504"), "values above the range of f16"),
+        (format == Format::F16 && why.contains("is under 20 dB"), "values below the precision of f16"),
     ];
     list.into_iter().find(|(is_it, _)| *is_it).map(|(_, reason)| reason)
 }
@@ -263,12 +266,12 @@ fn print(rows: &[Row]) {
         let (sequence, grid) = (&of_grid[0].sequence, &of_grid[0].grid);
         println!("| {sequence} | {grid} | {} | {refused} | {seconds:.1} | {default} |", of_grid.len());
     }
-    println!("\n| refused: sequence | grid | setting | right since | why |");
+    println!("\n| refused: sequence | grid | setting | known reason | message |");
     println!("|---|---|---|---|---|");
     for row in rows {
         let End::Refused { why, right_since } = &row.end else { continue };
         let (right_since, why) =
-            (right_since.unwrap_or("**no reason is known**"), why.replace(['\n', '|'], " "));
+            (right_since.unwrap_or("**no known reason**"), why.replace(['\n', '|'], " "));
         println!("| {} | {} | {} | {right_since} | {why} |", row.sequence, row.grid, row.setting);
     }
     let refused = rows.iter().filter(|row| matches!(row.end, End::Refused { .. })).count();
@@ -289,7 +292,7 @@ mod tests {
 
     #[test]
     fn no_good_pack_of_the_fixtures_is_refused() {
-        let fixtures = crate::peers::root().join("fixtures");
+        let fixtures = crate::peer_programs::root().join("fixtures");
         run(&Args { folders: vec![fixtures], no_pictures: true, json: None }).unwrap();
     }
 }

@@ -1,4 +1,4 @@
-//! Every format and range on each volume, and the tree beside the thesis's layout.
+//! Measures every format and range on each volume, and compares the size of the tree with the thesis's layout.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -12,36 +12,36 @@ use volpack::report::PackSummary;
 use volpack::settings::{Format, Quality, RangeMode, Settings};
 use volpack::verify::VerifyReport;
 
-use crate::{peers, sequence};
+use crate::{peer_programs, sequence};
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Sequences: a file or a glob each
+    /// Sequences, each a file or a glob
     #[arg(required = true)]
     sequences: Vec<PathBuf>,
-    /// A row a format and a column a volume: bits a voxel and PSNR, with brick ranges
+    /// Print one row per format and one column per volume: bits per voxel and PSNR, with brick ranges
     #[arg(long)]
     brief: bool,
-    /// Write the raw figures here too
+    /// Also write the raw figures to this JSON file
     #[arg(long)]
     json: Option<PathBuf>,
 }
 
-/// A format as it is asked for.
+/// A format with its settings.
 struct Way {
     name: String,
     range: Option<RangeMode>,
     settings: Settings,
 }
 
-/// A pack of one.
+/// A measured pack.
 struct Measured {
     seconds: f64,
     pack: PackSummary,
     report: VerifyReport,
 }
 
-/// Builds and measures all of it.
+/// Builds and measures every format of every sequence.
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     let folder = tempfile::tempdir()?;
     let sequences = args.sequences.iter().map(|s| sequence::named(s)).collect::<Result<Vec<_>, _>>()?;
@@ -80,7 +80,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 "active": report.active, "all": report.all, "peak": grid.peak, "failures": report.failures.len() }));
         }
     }
-    peers::write(args.json.as_deref(), &json!(rows))
+    peer_programs::write(args.json.as_deref(), &json!(rows))
 }
 
 fn ways() -> Vec<Way> {
@@ -114,7 +114,7 @@ fn measure(way: &Way, frames: &[PathBuf], folder: &Path) -> Result<Measured, Box
     build(&job, &mut Silent)?;
     let seconds = start.elapsed().as_secs_f64();
     job.verify = VerifyLevel::Voxels;
-    let report = build(&job, &mut Silent)?.verification.ok_or("it was verified")?;
+    let report = build(&job, &mut Silent)?.verification.ok_or("the build returned no verification")?;
     Ok(Measured { seconds, pack: PackSummary::new(&Pack::open(&job.output)?), report })
 }
 

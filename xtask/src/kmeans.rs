@@ -1,4 +1,4 @@
-//! Our k-means beside linfa's own fit: the same bricks, k, iterations, distance and seed.
+//! Compares our k-means with linfa's: the same bricks, k, iterations, distance and seed.
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -21,22 +21,22 @@ use volpack::vdb::VdbFile;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// OpenVDB files, all of whose bricks are clustered together
+    /// OpenVDB files; all their bricks are clustered together
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// The grid
+    /// Name of the grid to use
     #[arg(long, default_value = "density")]
     grid: String,
-    /// Clusters
+    /// Number of clusters
     #[arg(short, long, default_value_t = 1000)]
     k: usize,
-    /// Iterations
+    /// Number of iterations
     #[arg(short, long, default_value_t = 5)]
     iterations: usize,
-    /// How often both are timed; the fastest counts
+    /// Number of runs of each; the fastest is printed
     #[arg(long, default_value_t = 3)]
     repeats: u32,
-    /// Write the raw figures here too
+    /// Also write the raw figures to this JSON file
     #[arg(long)]
     json: Option<PathBuf>,
 }
@@ -59,7 +59,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             .init_method(KMeansInit::Random)
             .n_runs(1)
             .max_n_iterations(args.iterations as u64)
-            // Never met: both make every iteration.
+            // Never reached, so both make every iteration.
             .tolerance(1e-12);
         let start = Instant::now();
         let theirs = params.fit(&data)?;

@@ -1,4 +1,4 @@
-//! How fast a pack comes from a file in the page cache to the bytes that a GPU is given.
+//! Measures loading: from a pack in the page cache to the bytes for the GPU.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -11,7 +11,7 @@ use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::settings::{Format, Quality, Settings};
 use volpack::vdb::VdbFile;
 
-use crate::peers;
+use crate::peer_programs;
 use crate::process_stats::median;
 use crate::scale::Sequences;
 
@@ -19,10 +19,10 @@ use crate::scale::Sequences;
 pub struct Args {
     #[command(flatten)]
     sequences: Sequences,
-    /// How often each load is timed; the median counts
+    /// Number of runs of each load; the median is printed
     #[arg(long, default_value_t = 25)]
     rounds: usize,
-    /// Write the raw figures here too
+    /// Also write the raw figures to this JSON file
     #[arg(long)]
     json: Option<PathBuf>,
 }
@@ -39,7 +39,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
         rayon::current_num_threads()
     );
     println!(
-        "| format | frames | file MB | GPU MB | whole pack ms | GB/s of GPU bytes | open ms | one frame more ms | its .vdb ms |"
+        "| format | frames | file MB | GPU MB | whole pack ms | GB/s of GPU bytes | open ms | one more frame ms | its .vdb ms |"
     );
     println!("|---|---|---|---|---|---|---|---|---|");
     for format in [Format::Adaptive, Format::Bc7, Format::Unorm8, Format::F16] {
@@ -56,7 +56,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             for _ in 0..args.rounds {
                 whole.push(timed(|| load(&path))?);
                 open.push(timed(|| Pack::open(&path))?);
-                // A fresh pack: what was checked before is not checked again.
+                // Opened again, because a pack does not check a chunk twice.
                 let fresh = Pack::open(&path)?;
                 one.push(timed(|| fresh.frame(0, frame))?);
                 vdb.push(timed(|| read(&frames[frame]))?);
@@ -78,10 +78,13 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 "gpu_bytes": gpu_bytes, "whole": whole, "open": open, "frame": one, "vdb": vdb }));
         }
     }
-    peers::write(args.json.as_deref(), &json!({ "threads": rayon::current_num_threads(), "rows": rows }))
+    peer_programs::write(
+        args.json.as_deref(),
+        &json!({ "threads": rayon::current_num_threads(), "rows": rows }),
+    )
 }
 
-/// Everything that a GPU is given: the tree and each slab of each atlas, checked and unpacked.
+/// Loads all data for the GPU: the tree and each slab of each atlas, checked and decompressed.
 fn load(path: &Path) -> Result<(), Box<dyn Error>> {
     let pack = Pack::open(path)?;
     let slabs: Vec<_> = pack.atlases.iter().flat_map(|a| (0..a.slabs).map(|slab| (a.codec, slab))).collect();

@@ -1,9 +1,8 @@
-//! Work on volpack itself: benchmarks, checks against OpenVDB, mutation runs.
+//! Tasks for developers of volpack: benchmarks, comparison with OpenVDB, mutation runs.
 //!
-//! `cargo run --release -p xtask -- help` lists the tasks. None of them is part of the tests: they need
-//! peers from Debian (`libopenvdb-dev libboost-dev libtbb-dev libimath-dev g++`) or volumes of your own.
+//! `cargo run --release -p xtask -- help` lists the tasks. They are not part of the tests, because they need
+//! packages of Debian (`libopenvdb-dev libboost-dev libtbb-dev libimath-dev g++`) or your own volumes.
 
-mod beside;
 mod cache;
 mod clusters;
 mod corpus;
@@ -13,6 +12,7 @@ mod load;
 mod mutate;
 mod openvdb;
 mod pages;
+mod peer_programs;
 mod peers;
 mod pictures;
 mod process_stats;
@@ -37,61 +37,61 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Task {
-    /// Measure, side by side with a peer or a setting
+    /// Measure volpack, and compare it with other programs or settings
     #[command(subcommand)]
     Bench(Bench),
-    /// Pack every sequence below some folders in every way, and list what was refused: run before each release
+    /// Build every sequence below the given folders with every setting, and list the refused builds. Run it before each release
     Corpus(corpus::Args),
-    /// Draw the chart of a sweep anew from its JSON
+    /// Redraw the chart of a sweep from its JSON
     Chart {
-        /// The `sweep.json` of a `volpack sweep`
+        /// The `sweep.json` that `volpack sweep` wrote
         json: PathBuf,
-        /// The SVG to write
+        /// SVG file to write
         svg: PathBuf,
     },
-    /// Compare what volpack reads with what OpenVDB reads, on any files
+    /// Read files with volpack and with OpenVDB, and compare the results
     CheckOpenvdb {
         /// OpenVDB files
         #[arg(required = true)]
         files: Vec<PathBuf>,
     },
-    /// Run mutated files and packs through every reader, in 1 GiB of memory and 10 s each
+    /// Feed damaged files and packs to every reader, each with at most 1 GiB of memory and 10 s
     Mutate(mutate::Args),
-    /// Kill builds, damage the cache, run builds side by side: the packs must come out the same
+    /// Kill builds, damage the cache and run builds in parallel, and check that the packs stay the same
     StressCache(stress::Args),
-    /// Read files once and print how long it took (what `bench read` runs)
+    /// Read files and print the time (`bench read` runs this)
     #[command(hide = true)]
     ReadOnce(read::OnceArgs),
 }
 
 #[derive(Subcommand)]
 enum Bench {
-    /// Run what the pages of docs/benchmarks and the README are made of, and write it into them
+    /// Run the benchmarks of docs/benchmarks and the README, and write the results into these pages
     All(pages::Args),
-    /// Reading time and memory beside OpenVDB's C++ io::File
+    /// Time and memory of reading, compared with OpenVDB's C++ io::File
     Read(read::Args),
-    /// Builds with a cache: cold, without a change, after an edit, at another quality, at another level of zstd
+    /// Build time with a cache: cold, without a change, after an edit, at another quality, at another zstd level
     Cache(cache::Args),
-    /// A long sequence beside a short one: time, memory, cores in use
+    /// Time, memory and cores in use of a long sequence, compared with a short one
     Scale(scale::Args),
-    /// Whole builds beside NanoVDB's converter, the BC7 stage beside its encoder, files beside zstd
-    Peers(beside::Args),
-    /// From a pack in the page cache to the bytes that a GPU is given, beside reading the .vdb
+    /// Whole builds compared with NanoVDB's converter, the BC7 stage with its encoder, file sizes with zstd
+    Peers(peers::Args),
+    /// Time to load a pack from the page cache to the bytes for the GPU, compared with reading the .vdb
     Load(load::Args),
-    /// Every format and range on each volume: bytes, PSNR, largest error, seconds; and the tree beside
-    /// the thesis's layout
+    /// Every format and range on each volume: bytes, PSNR, maximum error, seconds; and the size of the tree,
+    /// compared with the thesis's layout
     Formats(formats::Args),
-    /// What clustering gives and costs: the columns of the thesis's figure 19
+    /// Bricks saved by k-means clustering, and its error: the columns of the thesis's figure 19
     Clusters(clusters::Args),
-    /// K-means of all bricks of a sequence beside linfa's own fit
+    /// K-means of all bricks of a sequence, compared with linfa's
     Kmeans(kmeans::Args),
-    /// Bytes at equal PSNR beside NanoVDB's FpN and beside uniform bc7
+    /// Bytes at equal PSNR, compared with NanoVDB's FpN and with uniform bc7
     Size(size::Args),
-    /// What each format costs the eye: FLIP, PSNR and RMSE of pictures of pack and source
+    /// Visual quality of each format: FLIP, PSNR and RMSE between pictures of pack and source
     Pictures(pictures::Args),
-    /// Milliseconds a frame on a GPU: every format, DDA and HDDA, at 1920 × 1080
+    /// Milliseconds per frame on a GPU: every format, with DDA and HDDA, at 1920 × 1080
     Trace(trace::Args),
-    /// The charts of quality against size, build time and trace time, or of stability
+    /// Charts of quality against size, build time and trace time, or of stability
     Sweep(sweep::Args),
 }
 
@@ -101,7 +101,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         Task::Bench(Bench::Read(args)) => read::bench(&args),
         Task::Bench(Bench::Cache(args)) => cache::bench(&args),
         Task::Bench(Bench::Scale(args)) => scale::bench(&args),
-        Task::Bench(Bench::Peers(args)) => beside::bench(&args),
+        Task::Bench(Bench::Peers(args)) => peers::bench(&args),
         Task::Bench(Bench::Load(args)) => load::bench(&args),
         Task::Bench(Bench::Formats(args)) => formats::bench(&args),
         Task::Bench(Bench::Clusters(args)) => clusters::bench(&args),

@@ -23,7 +23,7 @@ use common::{entry, guard, seeds};
 const BATCH: u64 = 500;
 /// Address space of a child in KiB: 1 GiB.
 const MEMORY: u64 = 1 << 20;
-/// What a case may take.
+/// Time limit of a case.
 const LIMIT: Duration = Duration::from_secs(10);
 /// How long nothing is heard of a child before it is killed. More than the limit, so that a case that
 /// is only slow is told from one that hangs.
@@ -34,13 +34,13 @@ const CHILD: &str = "VOLPACK_MUTATE_BATCH";
 /// Feed damaged files to the readers
 #[derive(clap::Args)]
 pub struct Args {
-    /// Damaged files of each kind
+    /// Number of damaged files of each kind
     #[arg(long, default_value_t = 20_000)]
     count: u64,
-    /// What the damage is drawn from
+    /// Seed of the random damage
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Run only this case of `--kind`, here and without limits, to debug it
+    /// Run only this case of `--kind`, in this process and without limits, to debug it
     #[arg(long, requires = "kind")]
     case: Option<u64>,
     /// Run only this kind
@@ -185,7 +185,7 @@ fn run_batch(
             }
             Err(mpsc::RecvTimeoutError::Timeout) => {
                 child.kill()?;
-                break format!("hangs: nothing was heard of it for {SILENCE:?}");
+                break format!("hangs: no output for {SILENCE:?}");
             }
             Err(mpsc::RecvTimeoutError::Disconnected) => break String::new(),
         }

@@ -9,7 +9,7 @@ use volpack::report::VdbSummary;
 use volpack::vdb::{Accessor, Scalar, VdbFile, with_scalar_type};
 use volpack::volume::Coord;
 
-use crate::peers;
+use crate::peer_programs;
 
 /// Keys that must be equal, numbers to this relative difference: both sides print 17 digits.
 const KEYS: [&str; 15] = [
@@ -35,7 +35,7 @@ const SUM_TOLERANCE: f64 = 1e-9;
 
 /// Checks every grid of every file.
 pub fn check(files: &[PathBuf]) -> Result<(), Box<dyn Error>> {
-    let facts_of = peers::compile_openvdb("fixtures/make_fixtures.cpp")?;
+    let facts_of = peer_programs::compile_openvdb("fixtures/make_fixtures.cpp")?;
     let mut differences = 0;
     for path in files {
         let output = Command::new(&facts_of).arg("--facts").arg(path).output()?;

@@ -1,4 +1,4 @@
-//! Every benchmark page by one command. A page has blocks that name the benchmark that makes them:
+//! Regenerates all benchmark pages with one command. A page has blocks that name the benchmark that writes them:
 //!
 //! ```text
 //! <!-- bench: kmeans plume/*.vdb -->
@@ -10,19 +10,19 @@ use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::peers::root;
+use crate::peer_programs::root;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// The pages to make anew, as "trace" or "README"; all where none is named
+    /// Pages to regenerate, such as "trace" or "README" [default: all]
     pages: Vec<String>,
-    /// The folder that the files of the blocks are in
+    /// Folder with the volumes that the blocks name
     #[arg(long, value_name = "DIR")]
     volumes: PathBuf,
-    /// The commit that is measured [default: git is asked]
+    /// Commit to print [default: the commit that is checked out]
     #[arg(long)]
     commit: Option<String>,
-    /// NanoVDB's headers, for `trace`: a folder that holds nanovdb/; again for another
+    /// Folder that contains nanovdb/, with NanoVDB's headers, for `trace`; repeat it for another version
     #[arg(long, value_name = "DIR")]
     nanovdb: Vec<PathBuf>,
 }
@@ -30,7 +30,7 @@ pub struct Args {
 const BEGIN: &str = "<!-- bench: ";
 const END: &str = "<!-- /bench -->";
 
-/// Runs the benchmarks of the pages and writes what they print into them. One that fails leaves its block as it was.
+/// Runs the benchmarks of the pages and writes their output into the blocks. If a benchmark fails, its block is not changed.
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     let commit = args.commit.clone().map_or_else(commit, Ok)?;
     let mut failed = 0;
@@ -45,7 +45,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
         while let Some((before, words, block, after)) = next_block(rest) {
             eprintln!("{name}: {words}");
             let block = run(args, words, &commit).unwrap_or_else(|why| {
-                eprintln!("{name}: {words}: left as it was: {why}");
+                eprintln!("{name}: {words}: block not changed: {why}");
                 failed += 1;
                 block.to_owned()
             });
@@ -55,7 +55,11 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
         new += rest;
         std::fs::write(&page, new)?;
     }
-    if failed > 0 { Err(format!("{failed} blocks were left as they were").into()) } else { Ok(()) }
+    if failed > 0 {
+        Err(format!("{failed} benchmarks failed; their blocks were not changed").into())
+    } else {
+        Ok(())
+    }
 }
 
 fn pages() -> Result<Vec<PathBuf>, Box<dyn Error>> {
@@ -67,7 +71,7 @@ fn pages() -> Result<Vec<PathBuf>, Box<dyn Error>> {
     Ok(pages)
 }
 
-/// What is before the next block, its words, what is in it, and what is behind it.
+/// The text before the next block, the block's command, its content, and the text after it.
 fn next_block(text: &str) -> Option<(&str, &str, &str, &str)> {
     let (before, rest) = text.split_once(BEGIN)?;
     let (words, rest) = rest.split_once(" -->")?;
@@ -75,7 +79,7 @@ fn next_block(text: &str) -> Option<(&str, &str, &str, &str)> {
     Some((before, words, block, after))
 }
 
-/// What a block says once its benchmark was run.
+/// Runs a benchmark and returns the new content of its block.
 fn run(args: &Args, words: &str, commit: &str) -> Result<String, Box<dyn Error>> {
     let is_sweep = words.starts_with("sweep");
     let mut command = Command::new(std::env::current_exe()?);
@@ -91,7 +95,7 @@ fn run(args: &Args, words: &str, commit: &str) -> Result<String, Box<dyn Error>>
     }
     let output = command.stderr(std::process::Stdio::inherit()).output()?;
     if !output.status.success() {
-        return Err(format!("it ended with {}", output.status).into());
+        return Err(format!("the benchmark ended with {}", output.status).into());
     }
     let printed = String::from_utf8(output.stdout)?;
     let date = Command::new("date").args(["-u", "+%Y-%m-%d"]).output()?.stdout;
@@ -103,7 +107,7 @@ fn run(args: &Args, words: &str, commit: &str) -> Result<String, Box<dyn Error>>
     Ok(format!("\n{date}, commit {commit}, {machine}:\n\n{words}\n\n{}\n", printed.trim()))
 }
 
-/// A command in lines of a page.
+/// Wraps a command into lines of at most about 110 characters.
 fn wrap(command: &str) -> String {
     let mut lines = vec![String::from("   ")];
     for word in command.split(' ') {
@@ -123,7 +127,7 @@ fn commit() -> Result<String, Box<dyn Error>> {
     let git = |arguments: &[&str]| -> Result<String, Box<dyn Error>> {
         let output = Command::new("git").args(arguments).current_dir(root()).output()?;
         if !output.status.success() {
-            return Err("git does not know the commit: name it with --commit".into());
+            return Err("git cannot tell the commit: give it with --commit".into());
         }
         Ok(String::from_utf8(output.stdout)?.trim().to_owned())
     };

@@ -1,4 +1,4 @@
-//! What each format costs the eye: pictures of pack and source, by the CPU tracer.
+//! Measures the visual quality of each format: compares pictures of pack and source.
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -11,17 +11,17 @@ use volpack::render::Device;
 use volpack::settings::{Format, Settings};
 use volpack::verify::{PictureSettings, Sources, pictures};
 
-use crate::{peers, sequence};
+use crate::{peer_programs, sequence};
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Sequences: a file or a glob each
+    /// Sequences, each a file or a glob
     #[arg(required = true)]
     sequences: Vec<PathBuf>,
-    /// Write the raw figures here too
+    /// Also write the raw figures to this JSON file
     #[arg(long)]
     json: Option<PathBuf>,
-    /// What traces the pack
+    /// Device that renders the pack
     #[arg(long, default_value = "cpu")]
     device: Device,
 }
@@ -53,5 +53,5 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             rows.push(json!({ "volume": name, "format": format, "flip": worst.flip, "psnr": worst.psnr, "rmse": worst.rmse }));
         }
     }
-    peers::write(args.json.as_deref(), &json!(rows))
+    peer_programs::write(args.json.as_deref(), &json!(rows))
 }

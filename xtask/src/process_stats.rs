@@ -1,4 +1,4 @@
-//! What a program takes: time, cores and memory.
+//! Measures time, cores and memory of a program.
 
 use std::error::Error;
 use std::path::Path;
@@ -12,13 +12,13 @@ use serde::Serialize;
 pub struct Run {
     /// Wall time.
     pub seconds: f64,
-    /// Seconds of all cores together, to the hundredths that the kernel counts.
+    /// CPU seconds of all cores together, in the kernel's steps of 0.01 s.
     pub cpu_seconds: f64,
-    /// The most memory it held, as it was seen every 2 ms.
+    /// Peak memory, sampled every 2 ms.
     pub peak_mib: f64,
 }
 
-/// Runs a program to its end.
+/// Runs a program and waits until it ends.
 ///
 /// # Errors
 /// When it cannot be started or fails.
@@ -45,7 +45,7 @@ pub fn run(command: &mut Command) -> Result<Run, Box<dyn Error>> {
     Ok(Run { seconds, cpu_seconds: children_seconds()? - cpu, peak_mib: peak_kib / 1024.0 })
 }
 
-/// What all children that have ended took of all cores.
+/// CPU seconds of all child processes that have ended.
 fn children_seconds() -> Result<f64, Box<dyn Error>> {
     let stat = std::fs::read_to_string("/proc/self/stat")?;
     // The name in parentheses may hold blanks; `cutime` and `cstime` are fields 16 and 17.
@@ -56,14 +56,14 @@ fn children_seconds() -> Result<f64, Box<dyn Error>> {
     Ok((ticks(16)? + ticks(17)?) / 100.0)
 }
 
-/// The median; not a number where there is nothing.
+/// The median; NaN if there are no values.
 pub fn median(figures: impl IntoIterator<Item = f64>) -> f64 {
     let mut figures: Vec<f64> = figures.into_iter().collect();
     figures.sort_by(f64::total_cmp);
     figures.get(figures.len() / 2).copied().unwrap_or(f64::NAN)
 }
 
-/// A build from the ground up that is not verified.
+/// A build without cache and without verification.
 pub fn build(volpack: &Path, options: &[&str], files: &[impl AsRef<Path>], output: &Path) -> Command {
     let mut command = Command::new(volpack);
     command.args(["build", "--quiet", "--no-cache", "--verify", "none"]).args(options);

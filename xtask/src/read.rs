@@ -1,4 +1,4 @@
-//! Reading time and memory beside OpenVDB's own reader.
+//! Compares time and memory of reading with OpenVDB's reader.
 
 use std::error::Error;
 use std::path::PathBuf;
@@ -8,21 +8,21 @@ use std::time::Instant;
 use serde_json::{Value as Json, json};
 use volpack::vdb::{VdbFile, with_scalar_type};
 
-use crate::peers;
+use crate::peer_programs;
 use crate::process_stats::median;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Sets of OpenVDB files to read, one set an option: --set a.vdb --set 'plume/*.vdb'
+    /// Set of OpenVDB files to read; repeat the option for more sets: --set a.vdb --set 'plume/*.vdb'
     #[arg(long = "set", required = true)]
     sets: Vec<String>,
-    /// Times each side reads each set, in turns
+    /// Number of processes per reader and set, in turns
     #[arg(long, default_value_t = 15)]
     rounds: usize,
-    /// Reads inside one process
+    /// Number of reads in one process
     #[arg(long, default_value_t = 20)]
     repeats: usize,
-    /// Write the raw figures here too
+    /// Also write the raw figures to this JSON file
     #[arg(long)]
     json: Option<PathBuf>,
 }
@@ -70,7 +70,7 @@ fn peak_rss_kib() -> Result<u64, Box<dyn Error>> {
 
 /// Runs both sides in turns and prints the ratio of their medians.
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
-    let theirs = peers::compile_openvdb("benches/peers/read_openvdb.cpp")?;
+    let theirs = peer_programs::compile_openvdb("benches/peers/read_openvdb.cpp")?;
     let ours = std::env::current_exe()?;
     let mut rows = Vec::new();
     println!("| files | OpenVDB ms | volpack ms | ratio | OpenVDB peak MiB | volpack peak MiB | ratio |");
@@ -91,7 +91,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             our_runs.push(run(&ours, &["read-once"])?);
         }
         if their_runs[0]["voxels"] != our_runs[0]["voxels"] {
-            return Err(format!("{set}: not the same voxels").into());
+            return Err(format!("{set}: the two readers found different numbers of voxels").into());
         }
         // Memory of a process that reads once, as a build does.
         let one = |program: &PathBuf, first: &[&str]| -> Result<f64, Box<dyn Error>> {

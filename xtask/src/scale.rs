@@ -1,4 +1,4 @@
-//! Time and memory of a long sequence beside those of a short one.
+//! Compares time and memory of a long sequence with those of a short one.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -6,25 +6,25 @@ use std::process::Command;
 
 use serde_json::json;
 
-use crate::peers;
+use crate::peer_programs;
 use crate::process_stats::{self, median};
 
 #[derive(clap::Args)]
 pub struct Args {
     #[command(flatten)]
     sequences: Sequences,
-    /// How often each build is measured, in turns; the median counts
+    /// Number of runs of each build, in turns; the median is printed
     #[arg(long, default_value_t = 5)]
     rounds: usize,
-    /// The volpack to run
-    #[arg(long, default_value_os_t = peers::volpack())]
+    /// Path of the volpack binary to run
+    #[arg(long, default_value_os_t = peer_programs::volpack())]
     volpack: PathBuf,
-    /// Write the raw figures here too
+    /// Also write the raw figures to this JSON file
     #[arg(long)]
     json: Option<PathBuf>,
 }
 
-/// Each with what the table calls it.
+/// The builds, each with its name in the table.
 const CASES: [(&str, &[&str]); 4] = [
     ("adaptive, 45 dB", &["--psnr", "45"]),
     ("bc7", &["--format", "bc7"]),
@@ -32,10 +32,10 @@ const CASES: [(&str, &[&str]); 4] = [
     ("f16", &["--format", "f16"]),
 ];
 
-/// What a long sequence may take of what a short one does.
+/// Limits of the ratios between the long and the short sequence.
 const MOST_MEMORY: f64 = 1.3;
 const MOST_TIME: f64 = 1.1;
-/// What cores may not fall below.
+/// Minimum fraction of cores in use.
 const LEAST_USE: f64 = 0.85;
 
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
@@ -84,7 +84,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
         );
         rows.push(json!({ "build": options, "short": shorts, "long": longs }));
     }
-    peers::write(
+    peer_programs::write(
         args.json.as_deref(),
         &json!({ "frames": [short.len(), long.len()], "cores": cores, "rows": rows }),
     )
@@ -93,29 +93,29 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
 /// A short sequence and a long one made of it.
 #[derive(clap::Args)]
 pub struct Sequences {
-    /// The frames of a short sequence
+    /// Files of the short sequence
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// How many times as long the long one is
+    /// Length of the long sequence, in repeats of the short one
     #[arg(long, default_value_t = 10)]
     repeats: usize,
 }
 
 impl Sequences {
-    /// The files of the long one, and how many of them are the short one. Each repeat is moved and scaled so that nothing
-    /// in it is in another.
+    /// Returns the files of the long sequence, and how many of them are the short one. Each repeat is moved and scaled, so that
+    /// no brick occurs twice.
     ///
     /// # Errors
     /// When OpenVDB is not installed.
     pub fn make(&self, folder: &Path) -> Result<(Vec<PathBuf>, usize), Box<dyn Error>> {
         let files = volpack::manifest::expand(&self.files)?;
-        let program = peers::compile_openvdb("benches/peers/repeat_openvdb.cpp")?;
+        let program = peer_programs::compile_openvdb("benches/peers/repeat_openvdb.cpp")?;
         let frames = folder.join("frames");
         std::fs::create_dir(&frames)?;
         let status =
             Command::new(program).arg(&frames).arg(self.repeats.to_string()).args(&files).status()?;
         if !status.success() {
-            return Err("the long sequence could not be made".into());
+            return Err("repeat_openvdb failed to write the long sequence".into());
         }
         Ok((volpack::manifest::expand(&[frames.join("*.vdb")])?, files.len()))
     }

@@ -1,9 +1,9 @@
-//! Sequences as benchmarks are given them.
+//! Sequences on the command line of a benchmark.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
 
-/// The files of a file name or glob, and what to call them: a sequence goes by its folder's name.
+/// Returns a name and the files of a file name or glob. The name of a sequence is that of its folder.
 ///
 /// # Errors
 /// When nothing matches.

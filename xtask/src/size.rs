@@ -1,4 +1,4 @@
-//! Bytes at equal PSNR: adaptive packs beside NanoVDB's FpN and beside our own uniform bc7.
+//! Compares bytes at equal PSNR: adaptive packs with NanoVDB's FpN and with our own uniform bc7.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -16,13 +16,13 @@ pub struct Args {
     /// OpenVDB files
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// The PSNRs that NanoVDB's tolerance is searched for
+    /// PSNRs in dB to reach with NanoVDB
     #[arg(long, value_delimiter = ',', default_value = "46,52")]
     psnr: Vec<f64>,
-    /// The grid
+    /// Name of the grid to use
     #[arg(long, default_value = "density")]
     grid: String,
-    /// Write the raw figures here too
+    /// Also write the raw figures to this JSON file
     #[arg(long)]
     json: Option<PathBuf>,
 }
@@ -37,7 +37,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     let folder = tempfile::tempdir()?;
     let mut rows = Vec::new();
     println!(
-        "| volume | beside | its dB | ours dB | its leaves | its grid | ours | ours / leaves | ours / grid |"
+        "| volume | compared with | its dB | volpack dB | its leaves KiB | its grid KiB | volpack KiB | volpack / leaves | volpack / grid |"
     );
     println!("|---|---|---|---|---|---|---|---|---|");
     for file in &args.files {
@@ -97,7 +97,7 @@ fn pack(
         Settings { grids: vec![args.grid.clone()], format, quality, ..Settings::default() },
         VerifyLevel::Voxels,
     );
-    let report = build(&job, &mut Silent)?.verification.ok_or("it was verified")?;
+    let report = build(&job, &mut Silent)?.verification.ok_or("the build returned no verification")?;
     let grid = &report.grids[0];
     let summary = PackSummary::new(&Pack::open(&job.output)?);
     Ok(Measured {
@@ -108,7 +108,7 @@ fn pack(
     })
 }
 
-/// The grid whose PSNR is the least above `target`, by bisection of the tolerance.
+/// The grid with the lowest PSNR that is at least `target`, by bisection of the tolerance.
 fn fpn(
     file: &Path,
     args: &Args,

@@ -1,4 +1,4 @@
-//! Builds that are killed, caches that are damaged, builds side by side: the packs must come out the same.
+//! Kills builds, damages caches and runs builds in parallel, and checks that the packs stay the same.
 
 use std::error::Error;
 use std::fs;
@@ -11,23 +11,24 @@ use rand_xoshiro::Xoshiro256Plus;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// The frames of one sequence
+    /// Files of one sequence
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// Builds that are killed at a random moment, and cache files that are damaged
+    /// Number of builds to kill at a random moment, and of cache files to damage
     #[arg(long, default_value_t = 200)]
     times: usize,
-    /// Processes side by side
+    /// Number of processes that build in parallel
     #[arg(long, default_value_t = 8)]
     processes: usize,
-    /// The volpack to run
+    /// Path of the volpack binary to run
     #[arg(long, default_value = "target/release/volpack")]
     volpack: PathBuf,
+    /// Seed of the random moments and damage
     #[arg(long, default_value_t = 1)]
     seed: u64,
 }
 
-/// What each build is asked for, in turns: so that one finds parts of another's work.
+/// Settings of the builds, in turns, so that builds find partial results of each other.
 const SETTINGS: [&[&str]; 4] =
     [&["--psnr", "45"], &["--psnr", "50"], &["--format", "bc7"], &["--max-error", "0.01"]];
 
@@ -36,7 +37,7 @@ struct Stress<'a> {
     files: Vec<PathBuf>,
     folder: PathBuf,
     cache: PathBuf,
-    /// What a build without a cache makes of each of the settings.
+    /// The pack of a build without a cache, for each of the settings.
     expected: Vec<Vec<u8>>,
     random: Xoshiro256Plus,
 }
@@ -77,17 +78,17 @@ impl Stress<'_> {
         command
     }
 
-    /// Builds with the cache as it is and compares; says how many warnings there were.
+    /// Builds with the current cache and compares the pack; returns the number of warnings.
     fn build(&self, i: usize, output: &Path) -> Result<usize, Box<dyn Error>> {
         let out = self.cached(SETTINGS[i], output).output()?;
         let said = String::from_utf8_lossy(&out.stderr);
         if !out.status.success() || fs::read(output)? != self.expected[i] {
-            return Err(format!("{:?}: {}, or other bytes: {said}", SETTINGS[i], out.status).into());
+            return Err(format!("{:?}: {}, or different bytes: {said}", SETTINGS[i], out.status).into());
         }
         Ok(said.matches("warning").count())
     }
 
-    /// Kills builds at random moments; each is followed by one that is left alone.
+    /// Kills builds at random moments; a complete build follows each.
     fn kills(&mut self) -> Result<(), Box<dyn Error>> {
         let output = self.folder.join("killed.volpack");
         let (mut killed, mut finished, mut warnings) = (0, 0, 0);
@@ -113,7 +114,7 @@ impl Stress<'_> {
                 killed += 1;
                 let after = fs::read(&output).ok();
                 if after != before && after.as_ref() != Some(&self.expected[i]) {
-                    return Err(format!("the kill after {wait:?} left another pack").into());
+                    return Err(format!("a build killed after {wait:?} left a different pack").into());
                 }
             }
             warnings += self.build(i, &output)?;
@@ -122,13 +123,13 @@ impl Stress<'_> {
         let leftovers =
             leftovers.filter(|e| e.file_name().to_string_lossy().starts_with(".volpack-")).count();
         println!(
-            "{killed} builds were killed ({finished} were quicker), every next one made the same bytes ({warnings} \
+            "{killed} builds killed ({finished} ended before the kill): every next build wrote the same bytes ({warnings} \
              warnings, {leftovers} unfinished packs left in the folder)"
         );
         Ok(())
     }
 
-    /// Damages one file of the cache at a time: a byte, its end, all of it, or what it was long ago.
+    /// Damages one file of the cache at a time: flips a bit, truncates it, empties it, or appends bytes.
     fn damages(&mut self) -> Result<(), Box<dyn Error>> {
         let output = self.folder.join("damaged.volpack");
         let _ = fs::remove_dir_all(&self.cache);
@@ -160,13 +161,13 @@ impl Stress<'_> {
             warnings += self.build(i, &output)?;
         }
         println!(
-            "{} cache files were damaged, every next build made the same bytes ({warnings} warnings)",
+            "{} cache files damaged: every next build wrote the same bytes ({warnings} warnings)",
             self.args.times
         );
         Ok(())
     }
 
-    /// Builds all settings in many processes on one store.
+    /// Builds all settings in parallel processes on one cache.
     fn side_by_side(&mut self) -> Result<(), Box<dyn Error>> {
         let _ = fs::remove_dir_all(&self.cache);
         let mut children = Vec::new();
@@ -188,10 +189,10 @@ impl Stress<'_> {
             .arg(&self.cache)
             .output()?;
         if !verified.status.success() {
-            return Err(format!("the store does not verify: {verified:?}").into());
+            return Err(format!("the cache does not verify: {verified:?}").into());
         }
         println!(
-            "{} processes on one store made the same bytes, and it verifies ({warnings} warnings)",
+            "{} processes on one cache: all wrote the same bytes, and the cache verifies ({warnings} warnings)",
             self.args.processes
         );
         Ok(())

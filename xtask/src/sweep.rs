@@ -1,38 +1,38 @@
-//! The charts of quality against cost: `volpack sweep`, where the pages keep them.
+//! Runs `volpack sweep` and copies its charts to the pages.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use crate::peers;
+use crate::peer_programs;
 use crate::sequence;
 
 #[derive(clap::Args)]
 pub struct Args {
-    /// Sequences: a file or a glob each
+    /// Sequences, each a file or a glob
     #[arg(required = true)]
     sequences: Vec<PathBuf>,
-    /// How steady each method is, instead of what it costs
+    /// Measure the stability of each method instead of its cost
     #[arg(long)]
     stability: bool,
-    /// How often builds and pictures are timed
+    /// Number of runs of each build and picture
     #[arg(long, default_value_t = 5)]
     repeats: u32,
-    /// Pixels of the pictures, as WIDTH HEIGHT
+    /// Size of the pictures in pixels, as WIDTH HEIGHT
     #[arg(long, num_args = 2, default_values_t = [1920, 1080])]
     size: Vec<u32>,
-    /// Threads of a build; two are what a small CI machine has
+    /// Threads of a build; the default is that of a small CI machine
     #[arg(long, default_value_t = 2)]
     threads: usize,
-    /// The volpack to run
-    #[arg(long, default_value_os_t = peers::volpack())]
+    /// Path of the volpack binary to run
+    #[arg(long, default_value_os_t = peer_programs::volpack())]
     volpack: PathBuf,
-    /// Draw the charts below this folder, in charts/ and runs/
-    #[arg(long, default_value_os_t = peers::root().join("docs/benchmarks"))]
+    /// Folder for the results, in its folders charts/ and runs/
+    #[arg(long, default_value_os_t = peer_programs::root().join("docs/benchmarks"))]
     output: PathBuf,
 }
 
-/// Sweeps each sequence; prints the charts as a page shows them.
+/// Sweeps each sequence and prints Markdown links to the charts.
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     let kind = if args.stability { "stability" } else { "sweep" };
     for sequence in &args.sequences {

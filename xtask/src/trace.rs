@@ -1,4 +1,4 @@
-//! Milliseconds a frame on a GPU: every format, cell by cell and node by node, beside NanoVDB's HDDA on the same
+//! Measures milliseconds per frame on a GPU: every format, with DDA and HDDA, compared with NanoVDB's HDDA on the same
 //! rays.
 
 use std::error::Error;
@@ -15,8 +15,8 @@ use volpack::settings::{Format, Settings};
 use volpack::sweep::nanovdb::{self, Quantise};
 use volpack::sweep::{Steady, steady};
 
-use crate::beside::TOLERANCE;
-use crate::peers;
+use crate::peer_programs;
+use crate::peers::TOLERANCE;
 use crate::process_stats::median;
 
 #[derive(clap::Args)]
@@ -24,16 +24,16 @@ pub struct Args {
     /// OpenVDB files
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// Times each picture is traced at least; the median counts, once three in a row agree
+    /// Minimum number of frames per picture; tracing continues until three medians in a row agree
     #[arg(long, default_value_t = 100)]
     repeats: u32,
-    /// Pixels, as WIDTH HEIGHT
+    /// Size of the pictures in pixels, as WIDTH HEIGHT
     #[arg(long, num_args = 2, default_values_t = [1920, 1080])]
     size: Vec<u32>,
-    /// A folder that holds nanovdb/, to trace with that one beside; again for another [default: the compiler's own]
+    /// Folder that contains nanovdb/, to compare with that version; repeat it for another [default: the compiler's path]
     #[arg(long, value_name = "DIR")]
     nanovdb: Vec<PathBuf>,
-    /// Write the raw figures here too
+    /// Also write the raw figures to this JSON file
     #[arg(long)]
     json: Option<PathBuf>,
 }
@@ -50,13 +50,17 @@ const LEVEL_SET: &[Shown] =
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     let gpu = Gpu::shared()?;
     if gpu.is_software {
-        return Err(format!("{} is no GPU: its times say nothing of one", gpu.name).into());
+        return Err(format!(
+            "{} is not a GPU, so its times are meaningless here: run this on a machine with a GPU",
+            gpu.name
+        )
+        .into());
     }
     let folder = tempfile::tempdir()?;
     let [width, height] = args.size[..] else { return Err("a size is WIDTH HEIGHT".into()) };
     let peers = peers(args);
     if let Err(reason) = &peers {
-        println!("NanoVDB is left out: {reason}\n");
+        println!("NanoVDB is not measured: {reason}\n");
     }
     let peers = peers.unwrap_or_default();
     println!("{} at {width} × {height}, medians of {} frames or more\n", gpu.name, args.repeats);
@@ -66,7 +70,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     for path in &args.files {
         bench.volume(path)?;
     }
-    peers::write(args.json.as_deref(), &json!({ "device": gpu.name, "rows": bench.rows }))
+    peer_programs::write(args.json.as_deref(), &json!({ "device": gpu.name, "rows": bench.rows }))
 }
 
 /// A compiled tracer of NanoVDB's.
@@ -77,7 +81,7 @@ struct Peer {
 
 fn peers(args: &Args) -> Result<Vec<Peer>, Box<dyn Error>> {
     let compile =
-        |headers| peers::compile_nanovdb(headers).map(|(program, version)| Peer { program, version });
+        |headers| peer_programs::compile_nanovdb(headers).map(|(program, version)| Peer { program, version });
     if args.nanovdb.is_empty() {
         return Ok(vec![compile(None)?]);
     }
@@ -199,7 +203,7 @@ impl Bench<'_> {
     }
 }
 
-/// The median; with a mark where it never came to rest.
+/// The median, marked if the batches never agreed.
 fn ms(timed: &Steady) -> String {
     format!("{:.3}{}", timed.median(), if timed.is_steady { "" } else { " (unsteady)" })
 }
