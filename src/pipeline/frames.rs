@@ -13,9 +13,9 @@ use crate::stages::dedup::{DedupError, Fetch, FrameIndex, MaskPolicy, SequenceTr
 use crate::stages::encodings::GridCache;
 use crate::stages::flatten::{Flattened, flatten};
 use crate::stages::metadata::{FrameSource, SequenceInfo};
-use crate::stages::select::{SelectedGrid, Selection, find};
+use crate::stages::select::{SelectedGrid, Selection};
 use crate::stages::serialise::{FrameInput, GridInput};
-use crate::vdb::{GridClass, VdbFile};
+use crate::vdb::{GridClass, VdbFile, find_grid};
 use crate::volume::{Blocks, Brick, FlatFrame};
 
 /// What frames pass through before anything is made of them.
@@ -148,7 +148,7 @@ fn flatten_grid(
     settings: &Settings,
 ) -> Result<Flattened> {
     // What the file says now may not be what it said when the grid was selected.
-    let info = find(&file.grids, &grid.source);
+    let info = find_grid(&file.grids, &grid.source);
     let info = info.filter(|info| info.value_type.is_scalar()).ok_or_else(|| {
         Error::Input(format!("{}: grid {:?} is gone: the file changed", frame.path.display(), grid.source))
     })?;
@@ -171,7 +171,7 @@ fn fetch(sequence: &SequenceInfo, grid: &SelectedGrid, settings: &Settings, at_o
 
 /// What the frame index of one grid of one frame depends on; `None` if the frame lacks the grid.
 fn key(frame: &FrameSource, grid: &SelectedGrid, settings: &Settings) -> Option<Key> {
-    let info = find(&frame.grids, &grid.source)?;
+    let info = find_grid(&frame.grids, &grid.source)?;
     let policy = mask_policy(settings, grid.class);
     let of_grid = (frame.digest.as_bytes(), &info.name, grid.component);
     Some(Key::new(&OUTLINE, &(of_grid, settings.nonfinite, policy)))
@@ -223,7 +223,7 @@ fn grid_input(
 ) -> GridInput {
     let frames = grid.frames.iter().map(|&i| {
         let frame = &sequence.frames[i];
-        let info = find(&frame.grids, &grid.source).expect("the grid was selected in this frame");
+        let info = find_grid(&frame.grids, &grid.source).expect("the grid was selected in this frame");
         let transform = info.transform.matrix.expect("the grid was selected for its linear map");
         FrameInput { number: frame.number, source: i as u32, transform }
     });

@@ -4,12 +4,13 @@ use std::path::Path;
 
 use super::{Job, Made, VerifyLevel};
 use crate::cache::{Blob, Cache, Key, Stage, Stamp};
+use crate::digest::digest;
 use crate::error::{Error, Result};
 use crate::pack::{FinishedPack, Pack, PackError, Provenance, repack};
 use crate::render::Device;
 use crate::render::gpu::Gpu;
 use crate::settings::Settings;
-use crate::stages::metadata::{Digests, digest};
+use crate::stages::metadata::Digests;
 use crate::verify::VerifyReport;
 
 const PACK: Stage = Stage { name: "pack", version: 1, travels: true };
