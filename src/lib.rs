@@ -11,6 +11,7 @@
 //!
 //! - [`vdb`] reads OpenVDB files.
 //! - [`volume`] has the types that flow: coordinates, masks, bricks, frames.
+//! - [`component`] says which grid of a file a grid of a pack is, and [`digest`] tells files apart.
 //! - [`codec`] knows how one brick becomes texels and what a GPU reads from them.
 //! - [`pack`] is the file format: writer, reader, checks, decoder.
 //! - [`pipeline`] strings the stages together, [`manifest`] says with what [`settings`].
@@ -38,6 +39,8 @@ pub mod cache;
 pub mod cancel;
 pub mod cli;
 pub mod codec;
+pub mod component;
+pub mod digest;
 pub mod error;
 pub mod file_stamp;
 pub mod manifest;

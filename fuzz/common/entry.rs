@@ -3,11 +3,11 @@
 
 use std::path::Path;
 
+use volpack::component::Component;
 use volpack::error::Error;
 use volpack::pack::{FrameReader, Pack, Region};
 use volpack::report::PackSummary;
 use volpack::settings::NonFinite;
-use volpack::stages::component::Component;
 use volpack::stages::flatten::flatten;
 use volpack::vdb::{Accessor, GridInfo, Value, VdbFile, with_scalar_type, with_value_type};
 use volpack::volume::Coord;

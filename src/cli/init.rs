@@ -14,9 +14,9 @@ use crate::manifest::DEFAULT_NAME;
 use crate::sequence::{Numbering, Sequence, number, sequences};
 use crate::settings::Integers;
 use crate::stages::flatten::nonfinite_background;
-use crate::stages::select::{FrameGrids, find as find_grid, listing, select_from};
+use crate::stages::select::{FrameGrids, listing, select_from};
 use crate::units::count;
-use crate::vdb::{GridInfo, VdbFile};
+use crate::vdb::{GridInfo, VdbFile, find_grid};
 
 /// What every key of a manifest means: the head of the project's own.
 fn keys() -> &'static str {

@@ -12,6 +12,7 @@ use super::style::{ERROR, GOOD, TITLE};
 use super::{Common, outln};
 use crate::atomic_file;
 use crate::cache::Cache;
+use crate::digest::digest;
 use crate::error::{Error, Result};
 use crate::manifest::{DEFAULT_NAME, expand};
 use crate::pack::Pack;
@@ -21,7 +22,6 @@ use crate::report::{
     Baseline, Breach, Gallery, PackSummary, Reported, gallery, html, junit, markdown, schema,
 };
 use crate::settings::Budget;
-use crate::stages::metadata::digest;
 use crate::sweep::cheaper;
 use crate::units::bytes;
 use crate::verify::PictureSettings;

@@ -13,8 +13,8 @@ use crate::settings::{Format, Masks, Settings};
 use crate::stages::dedup::{DedupError, Fetch, FrameIndex, MaskPolicy, SequenceTree};
 use crate::stages::flatten::{Flattened, flatten};
 use crate::stages::metadata::{FrameSource, SequenceInfo};
-use crate::stages::select::{SelectedGrid, Selection, find};
-use crate::vdb::{GridClass, VdbFile};
+use crate::stages::select::{SelectedGrid, Selection};
+use crate::vdb::{GridClass, VdbFile, find_grid};
 use crate::volume::{Blocks, Brick, FlatFrame};
 
 /// What frames pass through before anything is made of them.
@@ -143,7 +143,7 @@ fn flatten_grid(
     settings: &Settings,
 ) -> Result<Flattened> {
     // What the file says now may not be what it said when the grid was selected.
-    let info = find(&file.grids, &grid.source);
+    let info = find_grid(&file.grids, &grid.source);
     let info = info.filter(|info| info.value_type.is_scalar()).ok_or_else(|| {
         Error::Input(format!("{}: grid {:?} is gone: the file changed", frame.path.display(), grid.source))
     })?;
@@ -166,7 +166,7 @@ fn fetch(sequence: &SequenceInfo, grid: &SelectedGrid, settings: &Settings, at_o
 
 /// What the frame index of one grid of one frame depends on; `None` if the frame lacks the grid.
 fn key(frame: &FrameSource, grid: &SelectedGrid, settings: &Settings) -> Option<Key> {
-    let info = find(&frame.grids, &grid.source)?;
+    let info = find_grid(&frame.grids, &grid.source)?;
     let policy = mask_policy(settings, grid.class);
     let of_grid = (frame.digest.as_bytes(), &info.name, grid.component);
     Some(Key::new(&OUTLINE, &(of_grid, settings.nonfinite, policy)))

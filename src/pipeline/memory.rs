@@ -8,10 +8,10 @@ use std::path::{Path, PathBuf};
 use rayon::prelude::*;
 
 use super::{Plan, Resources};
+use crate::component::find_packed;
 use crate::error::{Error, Result};
 use crate::pack::Pack;
 use crate::settings::Integers;
-use crate::stages::component::find_packed;
 use crate::units::bytes;
 use crate::vdb::{TreeSize, VdbFile};
 use crate::volume::{BRICK_VOXELS, Brick};

@@ -5,13 +5,14 @@ use std::path::Path;
 use super::{Job, Made, VerifyLevel};
 use crate::cache::{Blob, Cache, Key, Stage};
 use crate::cancel::CancelToken;
+use crate::digest::digest;
 use crate::error::{Error, Result};
 use crate::file_stamp::Stamp;
 use crate::pack::{FinishedPack, Pack, PackError, Provenance, RepackError, repack};
 use crate::render::Device;
 use crate::render::gpu::Gpu;
 use crate::settings::Settings;
-use crate::stages::metadata::{Digests, KnownDigests, digest};
+use crate::stages::metadata::{Digests, KnownDigests};
 use crate::verify::VerifyReport;
 
 const PACK: Stage = Stage { name: "pack", version: 1, travels: true };

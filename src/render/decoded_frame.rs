@@ -2,11 +2,12 @@
 
 use std::collections::HashMap;
 
+use rayon::prelude::*;
+
 use crate::codec::Codec;
 use crate::pack::{FrameReader, PackError, Region};
-use crate::volume::{
-    BRICK_DIM, BRICK_VOXELS, CELL_DIM, CellContent, Child, Constant, Coord, CoordBox, FlatFrame, ROOT_DIM,
-};
+use crate::vdb::{Internal, Scalar, Tree};
+use crate::volume::{BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, CoordBox, Mask512, ROOT_DIM};
 
 /// A frame as nested constants and bricks of values.
 pub struct DecodedFrame {
@@ -65,6 +66,63 @@ pub enum Content<'a> {
     Brick(&'a DecodedBrick),
 }
 
+/// Where a constant goes, by its size.
+type PutConstant = fn(&mut DecodedFrame, Coord, Constant);
+
+/// How a tree's values are read.
+struct Source<F> {
+    background: f32,
+    value: F,
+}
+
+/// What becomes of a leaf.
+enum Leaf {
+    /// All inactive background: nothing.
+    Background,
+    /// One value, over which a ray steps at once.
+    Constant(Constant),
+    Voxels(Box<[f32; BRICK_VOXELS]>),
+}
+
+impl<F> Source<F> {
+    fn value<T: Scalar>(&self, value: T, active: bool) -> f32
+    where
+        F: Fn(T) -> f32,
+    {
+        let value = (self.value)(value);
+        // Where the background is 0, an inactive -0 is background too.
+        if active || self.background != 0.0 { value } else { value + 0.0 }
+    }
+
+    /// A tile, unless it is inactive background.
+    fn tile<T: Scalar>(&self, value: T, active: bool) -> Option<Constant>
+    where
+        F: Fn(T) -> f32,
+    {
+        let value = self.value(value, active);
+        (active || value != self.background).then_some(Constant { value, active })
+    }
+
+    fn leaf<T: Scalar>(&self, values: &[T; BRICK_VOXELS], mask: Mask512) -> Leaf
+    where
+        F: Fn(T) -> f32,
+    {
+        let values: Box<[f32; BRICK_VOXELS]> =
+            Box::new(std::array::from_fn(|i| self.value(values[i], mask.get(i))));
+        let active = mask == Mask512::ALL;
+        let is_one = active || mask == Mask512::NONE;
+        let value = values[0];
+        if !is_one || values.iter().any(|v| v.to_bits() != value.to_bits()) {
+            return Leaf::Voxels(values);
+        }
+        if active || value != self.background {
+            Leaf::Constant(Constant { value, active })
+        } else {
+            Leaf::Background
+        }
+    }
+}
+
 impl DecodedFrame {
     fn empty(background: f32) -> Self {
         Self {
@@ -76,31 +134,33 @@ impl DecodedFrame {
         }
     }
 
-    /// A frame of the source.
-    pub fn from_flat(frame: FlatFrame, background: f32) -> Self {
-        let mut field = Self::empty(background);
-        for (origin, constant) in frame.roots {
-            field.put_root(origin, constant);
+    /// A frame of the source, whose values become what `value` makes of them.
+    pub fn from_tree<T: Scalar>(tree: &Tree<T>, value: impl Fn(T) -> f32 + Sync) -> Self {
+        let source = Source { background: value(tree.background) + 0.0, value };
+        let mut field = Self::empty(source.background);
+        for tile in &tree.tiles {
+            if let Some(constant) = source.tile(tile.value, tile.active) {
+                field.put_root(tile.origin, constant);
+            }
         }
-        let mut bricks: Vec<Option<_>> = frame.bricks.into_iter().map(Some).collect();
-        for cell in frame.cells {
-            match cell.content {
-                CellContent::Constant(constant) => field.put_cell(cell.origin, constant),
-                CellContent::Node(children) => {
-                    for (place, child) in children {
-                        let origin = cell.origin.offset_by(Coord::child_offset(place.into(), 4, BRICK_DIM));
-                        match child {
-                            Child::Constant(constant) => field.put_region(origin, constant),
-                            Child::Brick(i) => {
-                                let brick = bricks[i as usize].take().expect("each brick is named once");
-                                field.put_brick(
-                                    origin,
-                                    DecodedBrick { values: Box::new(brick.values), uncertainty: 0.0 },
-                                );
-                            }
-                        }
+        let levels: [(&[Internal<T>], u32, i32, PutConstant); 2] =
+            [(&tree.l1, 5, CELL_DIM, Self::put_cell), (&tree.l2, 4, BRICK_DIM, Self::put_region)];
+        for (nodes, log2, dim, put) in levels {
+            for node in nodes {
+                for i in node.tile_indices() {
+                    if let Some(constant) = source.tile(node.tiles[i], node.is_active(i)) {
+                        put(&mut field, node.origin.offset_by(Coord::child_offset(i, log2, dim)), constant);
                     }
                 }
+            }
+        }
+        let leaf = |i: usize| source.leaf(tree.leaves.values(i), tree.leaves.masks[i]);
+        let leaves: Vec<Leaf> = (0..tree.leaves.len()).into_par_iter().map(leaf).collect();
+        for (origin, leaf) in tree.leaves.origins.iter().zip(leaves) {
+            match leaf {
+                Leaf::Background => {}
+                Leaf::Constant(constant) => field.put_region(*origin, constant),
+                Leaf::Voxels(values) => field.put_brick(*origin, DecodedBrick { values, uncertainty: 0.0 }),
             }
         }
         field

@@ -1,38 +1,11 @@
 //! Budgets that are exceeded, and which setting would meet them.
 
-use schemars::JsonSchema;
-use serde::Serialize;
-
-use super::model::{BuildReport, Figures, Total};
+use super::model::{Breach, BuildReport, Figures, Total};
 use crate::pack::Pack;
 use crate::settings::{Budget, ErrorBound, Format, Masks, Quality, Settings};
 use crate::units::{bytes, seconds};
 use crate::vdb::voxel_size;
 use crate::verify::VerifyReport;
-
-/// An exceeded budget.
-#[derive(Clone, Debug, Serialize, JsonSchema)]
-pub struct Breach {
-    /// The asset; null for all of them together.
-    pub asset: Option<String>,
-    /// The limit's key in the manifest.
-    pub budget: &'static str,
-    /// What is; null where it was not measured.
-    pub figure: Option<f64>,
-    /// What may be; null where that has the unit of a grid that was not measured.
-    pub limit: Option<f64>,
-    /// Both, for people.
-    pub message: String,
-    /// What would meet it.
-    pub remedy: String,
-}
-
-impl std::fmt::Display for Breach {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let asset = self.asset.as_deref().unwrap_or("all assets");
-        write!(f, "{asset}: {}: {}; {}", self.budget, self.message, self.remedy)
-    }
-}
 
 /// Texels that are fewer are packed less well, since what goes first is what packs best.
 const FILE_MARGIN: f64 = 0.1;

@@ -4,11 +4,10 @@ use askama::Template;
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 
-use super::budget::Breach;
 use super::chart::{ChartError, Line, frames_svg, histogram_svg};
 use super::gallery::{Gallery, Png};
 use super::markdown::arrow;
-use super::model::{AssetReport, Figures, PackReport, Report};
+use super::model::{AssetReport, Breach, Figures, PackReport, Report};
 use crate::units::{bytes, count, of_limit, percent, seconds};
 
 /// Why a page could not be made.

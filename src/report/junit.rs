@@ -41,7 +41,7 @@ pub fn junit(report: &Report) -> Result<String, quick_junit::SerializeError> {
 
 /// A failed case for each limit that an asset, or all of them, are past.
 fn over(report: &Report, asset: Option<&str>) -> Vec<TestCase> {
-    let case = |breach: &super::Breach| {
+    let case = |breach: &super::model::Breach| {
         let mut status = TestCaseStatus::non_success(NonSuccessKind::Failure);
         status.set_message(format!("{}; {}", breach.message, breach.remedy));
         TestCase::new(format!("budget {}", breach.budget), status)

@@ -15,11 +15,12 @@ mod vdb;
 use std::path::Path;
 
 pub use baseline::Baseline;
-pub use budget::{Breach, Checked, of_total};
+pub use budget::{Checked, of_total};
 pub use gallery::{Gallery, KeyFrame, Png, Strip, gallery};
 pub use html::html;
 pub use junit::junit;
 pub use markdown::markdown;
+pub use model::Breach;
 pub use pack::{CodecSummary, PackSummary};
 pub use vdb::{GridSummary, TopologySummary, ValueSummary, VdbSummary};
 

@@ -6,7 +6,6 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::PackSummary;
-use super::budget::Breach;
 use crate::cache::Uses;
 use crate::pack::Source;
 use crate::settings::Budget;
@@ -34,6 +33,30 @@ pub struct Report {
     pub total: Total,
     /// Every limit that is past.
     pub breaches: Vec<Breach>,
+}
+
+/// An exceeded budget.
+#[derive(Clone, Debug, Serialize, JsonSchema)]
+pub struct Breach {
+    /// The asset; null for all of them together.
+    pub asset: Option<String>,
+    /// The limit's key in the manifest.
+    pub budget: &'static str,
+    /// What is; null where it was not measured.
+    pub figure: Option<f64>,
+    /// What may be; null where that has the unit of a grid that was not measured.
+    pub limit: Option<f64>,
+    /// Both, for people.
+    pub message: String,
+    /// What would meet it.
+    pub remedy: String,
+}
+
+impl std::fmt::Display for Breach {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let asset = self.asset.as_deref().unwrap_or("all assets");
+        write!(f, "{asset}: {}: {}; {}", self.budget, self.message, self.remedy)
+    }
 }
 
 /// Sums over assets.

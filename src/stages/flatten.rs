@@ -2,9 +2,9 @@
 
 use rayon::prelude::*;
 
+use crate::component::Component;
 use crate::error::{Error, Result};
 use crate::settings::NonFinite;
-use crate::stages::component::Component;
 use crate::vdb::{GridInfo, LEAVES_IN_BLOCK, Scalar, Tree, VdbFile, with_scalar_type};
 use crate::volume::{
     BRICK_VOXELS, Brick, CELL_DIM, Cell, CellContent, Child, Constant, Coord, FlatFrame, FrameStats, Mask512,

@@ -1,11 +1,11 @@
 //! Stage 1: read every file's header and grid descriptors, no voxels.
 
 use std::collections::BTreeMap;
-use std::fs::File;
 use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
+use crate::digest::digest;
 use crate::error::{Error, Result};
 use crate::file_stamp::Stamp;
 use crate::sequence::{Numbering, number};
@@ -146,16 +146,6 @@ impl Digests<'_> {
         }
         Ok(digest)
     }
-}
-
-/// BLAKE3 of a file's bytes, and how many there are.
-///
-/// # Errors
-/// When the file cannot be read.
-pub fn digest(path: &Path) -> Result<(blake3::Hash, u64)> {
-    let mut hasher = blake3::Hasher::new();
-    File::open(path).and_then(|file| hasher.update_reader(file).map(drop)).map_err(Error::io(path))?;
-    Ok((hasher.finalize(), hasher.count()))
 }
 
 fn file_name(path: &Path) -> String {

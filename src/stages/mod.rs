@@ -3,7 +3,7 @@
 //! | | stage | gives |
 //! |---|---|---|
 //! | 1 | [`metadata`] | [`metadata::SequenceInfo`]: every file's header and grids |
-//! | 2 | [`select`], [`component`] | [`select::Selection`]: the grids to pack, their frames, and what of their values |
+//! | 2 | [`select`] | [`select::Selection`]: the grids to pack, their frames, and what of their values |
 //! | 3 | [`flatten`] | [`crate::volume::FlatFrame`]: cells and bricks of one frame |
 //! | 4 | [`dedup`] | [`dedup::SequenceTree`]: nodes and bricks shared across the sequence |
 //! | 5, 7 | [`encoder_cache`] | what each codec makes of each brick, made once |
@@ -13,7 +13,6 @@
 //! | 8 | [`serialise`] | the `.volpack` file |
 
 pub mod allocate;
-pub mod component;
 pub mod dedup;
 pub mod encoder_cache;
 pub mod flatten;

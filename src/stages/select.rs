@@ -2,11 +2,11 @@
 
 use std::path::Path;
 
+use crate::component::{Component, packed_as};
 use crate::error::{Error, Result};
 use crate::settings::Integers;
-use crate::stages::component::{Component, packed_as};
 use crate::stages::metadata::SequenceInfo;
-use crate::vdb::{GridClass, GridInfo, voxel_size};
+use crate::vdb::{GridClass, GridInfo, find_grid, voxel_size};
 
 /// The grid that is packed when none is named and several could be.
 const DEFAULT_GRID: &str = "density";
@@ -74,7 +74,7 @@ impl SelectedGrid {
     pub fn facts(&self, sequence: &SequenceInfo, fps: Option<f32>) -> GridFacts {
         let frame = |&i: &usize| {
             let frame = &sequence.frames[i];
-            let info = find(&frame.grids, &self.source).expect("the grid was selected in this frame");
+            let info = find_grid(&frame.grids, &self.source).expect("the grid was selected in this frame");
             let transform = info.transform.matrix.expect("the grid was selected for its linear map");
             FrameFacts { number: frame.number, source: i as u32, transform }
         };
@@ -121,7 +121,7 @@ pub fn select_from(frames: &[FrameGrids], names: &[String], integers: Integers) 
             return Err(Error::Usage(format!("grid {name:?} is asked for twice")));
         }
         let whole = select_one(frames, name, &mut selection.warnings)?;
-        let first = find(frames[whole.frames[0]].grids, name).expect("it was selected in this frame");
+        let first = find_grid(frames[whole.frames[0]].grids, name).expect("it was selected in this frame");
         for (name, component) in packed_as(first, integers) {
             if selection.grids.iter().any(|grid| grid.name == name) {
                 return Err(Error::Usage(format!(
@@ -134,18 +134,9 @@ pub fn select_from(frames: &[FrameGrids], names: &[String], integers: Integers) 
     Ok(selection)
 }
 
-/// The grid of that name in one frame. `density` also finds the first of several of that name,
-/// `density[0]`.
-pub fn find<'a>(grids: &'a [GridInfo], name: &str) -> Option<&'a GridInfo> {
-    grids
-        .iter()
-        .find(|g| g.name == name)
-        .or_else(|| grids.iter().find(|g| g.name.strip_prefix(name).is_some_and(|rest| rest == "[0]")))
-}
-
 fn default_grid(frames: &[FrameGrids]) -> Result<String> {
     let all = frames.iter().flat_map(|f| f.grids);
-    if frames.iter().any(|f| find(f.grids, DEFAULT_GRID).is_some()) {
+    if frames.iter().any(|f| find_grid(f.grids, DEFAULT_GRID).is_some()) {
         return Ok(DEFAULT_GRID.to_owned());
     }
     let obstacle = all.clone().find_map(|g| Some(format!("; {:?} {}", g.name, g.obstacle()?)));
@@ -181,7 +172,7 @@ fn select_one(frames: &[FrameGrids], name: &str, warnings: &mut Vec<String>) -> 
     let mut first: Option<&GridInfo> = None;
     let mut missing = Vec::new();
     for (i, frame) in frames.iter().enumerate() {
-        let Some(grid) = find(frame.grids, name) else {
+        let Some(grid) = find_grid(frame.grids, name) else {
             missing.push(frame.number.to_string());
             continue;
         };

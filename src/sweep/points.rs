@@ -7,6 +7,7 @@ use super::field::{Bricks, Difference, Jumps};
 use super::nanovdb::{self, NanoError, Quantise};
 use super::steady::steady;
 use super::{Method, Options, Skipped, Sweep, each};
+use crate::component::Component;
 use crate::error::{Error, Result};
 use crate::pack::Pack;
 use crate::pipeline::{Progress, Silent, build};
@@ -15,10 +16,8 @@ use crate::render::{Mode, Scene, View};
 use crate::report::PackSummary;
 use crate::report::chart::Point;
 use crate::settings::Integers;
-use crate::stages::component::Component;
 use crate::stages::flatten::{Flattened, flatten};
-use crate::stages::select::find;
-use crate::vdb::{Accessor, GridInfo, Tree, VdbFile, with_scalar_type};
+use crate::vdb::{Accessor, GridInfo, Tree, VdbFile, find_grid, with_scalar_type};
 use crate::verify::{self, Sources};
 use crate::volume::{Coord, ValueRange};
 
@@ -109,7 +108,7 @@ impl Source {
 /// One frame of the source; `None` if it lacks the grid.
 pub(super) fn flat_frame(path: &Path, grid: &str, options: &Options) -> Result<Option<Flattened>> {
     let file = VdbFile::open(path).map_err(Error::vdb(path))?;
-    let Some(info) = find(&file.grids, grid) else { return Ok(None) };
+    let Some(info) = find_grid(&file.grids, grid) else { return Ok(None) };
     Ok(Some(flatten(&file, path, info, Component::Whole, options.nonfinite)?))
 }
 
@@ -230,7 +229,7 @@ pub fn difference(source: &Path, other: &Path, grid: &str) -> Result<Difference>
     let open = |path: &Path| VdbFile::open(path).map_err(Error::vdb(path));
     let (source_file, other_file) = (open(source)?, open(other)?);
     let info = |file: &VdbFile, path: &Path| -> Result<GridInfo> {
-        let found = find(&file.grids, grid).cloned();
+        let found = find_grid(&file.grids, grid).cloned();
         found.ok_or_else(|| Error::Input(format!("{}: there is no grid {grid:?}", path.display())))
     };
     let (a, b) = (info(&source_file, source)?, info(&other_file, other)?);

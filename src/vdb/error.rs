@@ -1,7 +1,9 @@
 //! What can be wrong with an OpenVDB file.
 
-use super::file::NEWEST;
 use super::other_format::OtherFormat;
+
+/// The newest version whose layout was checked against OpenVDB's own source.
+pub(super) const NEWEST: u32 = 225;
 
 /// Why an OpenVDB file, or one grid of it, could not be read.
 #[derive(Debug, thiserror::Error)]

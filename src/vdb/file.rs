@@ -8,6 +8,7 @@ use std::path::Path;
 use std::sync::Mutex;
 
 use super::cursor::Cursor;
+use super::error::NEWEST;
 use super::grid::{Descriptor, GridInfo, read_metadata};
 use super::other_format::{HEAD, OtherFormat};
 use super::tree::{Tree, TreeSize};
@@ -19,8 +20,6 @@ use super::{Result, VdbError};
 const MAGIC: u64 = 0x5644_4220;
 /// `NODE_MASK_COMPRESSION`: older files order a node's data otherwise.
 const OLDEST: u32 = 222;
-/// The newest version whose layout was checked against OpenVDB's own source.
-pub(super) const NEWEST: u32 = 225;
 /// First guess of how many bytes a header needs; a grid's metadata can be longer.
 const WINDOW: u64 = 16 << 10;
 

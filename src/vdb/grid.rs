@@ -164,6 +164,14 @@ impl GridInfo {
     }
 }
 
+/// The grid of that name among a file's grids. `density` also finds the first of several of that name, `density[0]`.
+pub fn find_grid<'a>(grids: &'a [GridInfo], name: &str) -> Option<&'a GridInfo> {
+    grids
+        .iter()
+        .find(|g| g.name == name)
+        .or_else(|| grids.iter().find(|g| g.name.strip_prefix(name).is_some_and(|rest| rest == "[0]")))
+}
+
 /// An entry of a `MetaMap`.
 pub(super) struct Metadata<'a> {
     pub name: String,

@@ -25,7 +25,7 @@ mod value;
 
 pub use error::VdbError;
 pub use file::VdbFile;
-pub use grid::{GridClass, GridInfo};
+pub use grid::{GridClass, GridInfo, find_grid};
 pub use half::f16;
 pub use other_format::OtherFormat;
 pub use stats::{TopologyStats, ValueStats};

@@ -2,11 +2,11 @@
 
 use rayon::prelude::*;
 
+use super::Reading;
 use super::promise::Promise;
 use crate::codec::{BrickRange, Codec};
 use crate::pack::{FrameReader, Region};
-use crate::settings::{Format, Masks, NonFinite};
-use crate::stages::component::Component;
+use crate::settings::{Format, Masks};
 use crate::vdb::{Accessor, GridInfo, Internal, Scalar, Tree};
 use crate::volume::{
     BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, InactiveRule, Mask512, ROOT_DIM, ValueRange,
@@ -116,11 +116,11 @@ impl FrameError {
 pub(super) fn compare<T: Scalar>(
     tree: &Tree<T>,
     info: &GridInfo,
-    component: Component,
+    reading: Reading,
     reader: &FrameReader,
     promise: &Promise,
 ) -> FrameError {
-    let c = Comparison { tree, component, reader, promise };
+    let c = Comparison { tree, reading, reader, promise };
     let mut error = FrameError::default();
     c.check_header(info, &mut error);
     c.check_tiles(&mut error);
@@ -134,7 +134,7 @@ pub(super) fn compare<T: Scalar>(
 
 struct Comparison<'a, T> {
     tree: &'a Tree<T>,
-    component: Component,
+    reading: Reading,
     reader: &'a FrameReader<'a>,
     promise: &'a Promise<'a>,
 }
@@ -144,19 +144,6 @@ struct Comparison<'a, T> {
 const NORM_TOLERANCE: f64 = 1e-12;
 
 impl<T: Scalar> Comparison<'_, T> {
-    /// The source's value as the pack should have it.
-    fn value(&self, value: T) -> f32 {
-        let value = self.component.to_f32(value);
-        if value.is_finite() || self.promise.settings.nonfinite == NonFinite::Refuse { value } else { 0.0 }
-    }
-
-    /// How far a decoded value is from the source's, in the source's own type.
-    fn error(&self, ours: f32, theirs: T) -> f64 {
-        let packed = self.component.to_f32(theirs);
-        let is_packed = packed.is_finite() || self.promise.settings.nonfinite == NonFinite::Refuse;
-        if is_packed { self.component.error_of(theirs, ours) } else { f64::from(ours) }
-    }
-
     fn check_header(&self, info: &GridInfo, error: &mut FrameError) {
         let frame = &self.reader.frame().record;
         let stats = self.tree.topology_stats();
@@ -170,7 +157,7 @@ impl<T: Scalar> Comparison<'_, T> {
         if Some(frame.transform) != info.transform.matrix {
             error.fail(|| "the transform is not the source's".to_owned());
         }
-        let (ours, theirs) = (self.reader.grid().background, self.value(self.tree.background));
+        let (ours, theirs) = (self.reader.grid().background, self.reading.value(self.tree.background));
         let empty = stats.leaves == 0 && self.tree.l1.is_empty() && self.tree.tiles.is_empty();
         if ours != theirs && !empty {
             error.fail(|| format!("the background is {ours}, the source's is {theirs}"));
@@ -195,7 +182,7 @@ impl<T: Scalar> Comparison<'_, T> {
     }
 
     fn check_tile(&self, origin: Coord, dim: i32, value: T, active: bool, error: &mut FrameError) {
-        let value = self.value(value);
+        let value = self.reading.value(value);
         if active {
             error.active_value(value);
         } else if value == self.reader.grid().background {
@@ -228,7 +215,9 @@ impl<T: Scalar> Comparison<'_, T> {
         self.reader.for_each_region(|origin, dim, _| {
             error.has_regions = true;
             let fits = match source.tile(origin) {
-                Some(tile) => tile.dim >= dim && (tile.active || self.value(tile.value) != background),
+                Some(tile) => {
+                    tile.dim >= dim && (tile.active || self.reading.value(tile.value) != background)
+                }
                 None => dim == BRICK_DIM,
             };
             if !fits {
@@ -294,7 +283,8 @@ impl<T: Scalar> Comparison<'_, T> {
                 // The value lies between the least and the greatest that it stands for.
                 let (source, mask) = (self.tree.leaves.values(leaf), &self.tree.leaves.masks[leaf]);
                 let texel_mask = (0..BRICK_VOXELS).filter(|&i| mask.get(i) || !exact_inactive);
-                let range = ValueRange::union_all(texel_mask.map(|i| ValueRange::of(self.value(source[i]))));
+                let range =
+                    ValueRange::union_all(texel_mask.map(|i| ValueRange::of(self.reading.value(source[i]))));
                 Bound::Within(range.map_or(0.0, ValueRange::width))
             }
             Codec::Constant | Codec::F32 => Bound::Exact,
@@ -312,7 +302,7 @@ impl<T: Scalar> Comparison<'_, T> {
         let origin = self.tree.leaves.origins[leaf];
         let source = self.tree.leaves.values(leaf);
         let mask = &self.tree.leaves.masks[leaf];
-        mask.ones().for_each(|i| error.active_value(self.value(source[i])));
+        mask.ones().for_each(|i| error.active_value(self.reading.value(source[i])));
 
         let background = self.reader.grid().background;
         let (region, _) = self.reader.locate(origin);
@@ -339,8 +329,8 @@ impl<T: Scalar> Comparison<'_, T> {
             error.fail(|| format!("the brick at {:?} has other active voxels", origin.0));
         }
         for i in 0..BRICK_VOXELS {
-            let (ours, theirs) = (values[i], self.value(source[i]));
-            let difference = self.error(ours, source[i]);
+            let (ours, theirs) = (values[i], self.reading.value(source[i]));
+            let difference = self.reading.error(ours, source[i]);
             let float_difference = f64::from(ours) - f64::from(theirs);
             let flipped = self.promise.sign_matters.is_some() && (ours < 0.0) != (theirs < 0.0);
             let from_texel = contract.codec.filter(|_| mask.get(i) || !contract.exact_inactive);

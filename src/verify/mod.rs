@@ -1,9 +1,9 @@
 //! Compares a pack with its source.
 //!
 //! Three rings. Structure is [`crate::pack::Pack::open`] with [`crate::pack::Pack::check_chunks`]. Voxels
-//! ([`voxels`]) reads the source anew and asks the pack for every leaf voxel and every tile of it,
-//! without anything that the build computed. Pictures
-//! ([`pictures()`]) traces both.
+//! ([`voxels`]) reads the source anew and asks the pack for every leaf voxel and every tile of it.
+//! Pictures ([`pictures()`]) traces both. Neither uses anything that the build computed, nor any of its
+//! [`crate::stages`]: what a stage does wrong would be wrong on both sides, and seen on none.
 
 mod compare;
 mod metrics;
@@ -22,13 +22,13 @@ pub use pictures::{
     look, pictures, shown_frames,
 };
 
+use crate::component::{Component, find_packed};
+use crate::digest::digest;
 use crate::error::{Error, Result};
 use crate::pack::{Frame, Grid, Pack, Provenance};
 use crate::progress::Progress;
-use crate::settings::Settings;
-use crate::stages::component::find_packed;
-use crate::stages::metadata::digest;
-use crate::vdb::{GridClass, VdbFile, with_scalar_type};
+use crate::settings::{NonFinite, Settings};
+use crate::vdb::{GridClass, Scalar, ValueType, VdbFile, with_scalar_type};
 use compare::{FrameError, compare};
 use promise::Promise;
 pub use promise::{KEPT_INTEGER_ERROR, SIGN_MATTERS_VOXELS};
@@ -101,6 +101,40 @@ pub fn voxels(
         errors.push((frames.into_iter().map(|frame| frame.error).collect(), is_integer));
     }
     Ok(VerifyReport::new(pack, settings, errors, failures))
+}
+
+/// How values of a source are read: as a pack should have them.
+#[derive(Clone, Copy)]
+struct Reading {
+    component: Component,
+    nonfinite: NonFinite,
+}
+
+impl Reading {
+    /// The value that a pack should have.
+    fn value<T: Scalar>(self, value: T) -> f32 {
+        let value = self.component.to_f32(value);
+        if self.keeps(value) { value } else { 0.0 }
+    }
+
+    /// How far a decoded value is from the source's, in the source's own type.
+    fn error<T: Scalar>(self, ours: f32, theirs: T) -> f64 {
+        if self.keeps(self.component.to_f32(theirs)) {
+            self.component.error_of(theirs, ours)
+        } else {
+            f64::from(ours)
+        }
+    }
+
+    /// Whether a value is packed as it is, not as 0.
+    fn keeps(self, value: f32) -> bool {
+        value.is_finite() || self.nonfinite == NonFinite::Refuse
+    }
+}
+
+/// The error for a grid of a type that no pack is made from.
+fn not_packable(path: &Path, grid: &str, value_type: &ValueType) -> Error {
+    Error::Verify(format!("{}: grid {grid:?} is {} in the file", path.display(), value_type.name()))
 }
 
 /// What a frame of a pack came to beside its source.
@@ -205,6 +239,7 @@ fn compare_source(
             ));
         }
         let promise = Promise::new(grid, settings, info.value_type.is_integer());
+        let reading = Reading { component, nonfinite: settings.nonfinite };
         for f in frames {
             let reader = pack.frame(g, f).map_err(|e| {
                 Error::Verify(format!("grid {:?} frame {}: {e}", grid.name, grid.frames[f].record.number))
@@ -212,11 +247,9 @@ fn compare_source(
             let error = with_scalar_type!(&info.value_type,
                 T => {
                     let tree = file.read_tree::<T>(info).map_err(Error::vdb(path))?;
-                    compare(&tree, info, component, &reader, &promise)
+                    compare(&tree, info, reading, &reader, &promise)
                 },
-                other => return Err(Error::Verify(format!(
-                    "{}: grid {:?} is {} in the file", path.display(), grid.name, other.name()
-                )))
+                other => return Err(not_packable(path, &grid.name, other))
             );
             let is_integer = info.value_type.is_integer();
             out.push(FoundFrame { place: [g, f], class: info.class, is_integer, error });

@@ -9,17 +9,16 @@ use std::path::{Path, PathBuf};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::Sources;
+use super::{Reading, Sources, not_packable};
 use crate::cancel::CancelToken;
+use crate::component::find_packed;
 use crate::error::{Error, Result};
 use crate::pack::{Grid, Pack};
 use crate::render::{
     DecodedFrame, Device, Difference, Image, Mode, Renderer, Scene, TraceError, View, apart, difference,
     optical_depths, spread, trace, trace_noting_bc4, write_png,
 };
-use crate::stages::component::find_packed;
-use crate::stages::flatten::flatten;
-use crate::vdb::VdbFile;
+use crate::vdb::{VdbFile, with_scalar_type};
 
 /// Pixels of a picture's side.
 const SIDE: u32 = 256;
@@ -297,8 +296,14 @@ fn source_field(pack: &Pack, sources: &Sources, [g, f]: [usize; 2]) -> Result<De
     let settings = &sources.provenance.settings;
     let (info, component) = find_packed(&file.grids, &grid.name, settings.integers)
         .ok_or_else(|| missing_grid(path, &grid.name))?;
-    let flat = flatten(&file, path, info, component, settings.nonfinite)?;
-    Ok(DecodedFrame::from_flat(flat.frame, flat.background))
+    let reading = Reading { component, nonfinite: settings.nonfinite };
+    with_scalar_type!(&info.value_type,
+        T => {
+            let tree = file.read_tree::<T>(info).map_err(Error::vdb(path))?;
+            Ok(DecodedFrame::from_tree(&tree, |value: T| reading.value(value)))
+        },
+        other => Err(not_packable(path, &grid.name, other))
+    )
 }
 
 /// The error for a source without the grid that was packed from it.

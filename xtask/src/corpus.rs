@@ -75,8 +75,8 @@ pub fn run(args: &Args) -> Result<(), Box<dyn Error>> {
                 }
             }
             Err(why) => {
-                let right_since = (volpack::cli::exit_code::of(&why) == 6)
-                    .then_some("no grid has a supported type");
+                let right_since =
+                    (volpack::cli::exit_code::of(&why) == 6).then_some("no grid has a supported type");
                 let end = End::Refused { why: why.to_string(), right_since };
                 rows.push(Row {
                     sequence: name,

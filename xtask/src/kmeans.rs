@@ -12,12 +12,11 @@ use ndarray::Array2;
 use rand::SeedableRng;
 use rand_xoshiro::Xoshiro256Plus;
 use serde_json::json;
+use volpack::component::Component;
 use volpack::settings::NonFinite;
 use volpack::stages::allocate::kmeans::{KMeansSettings, kmeans};
-use volpack::stages::component::Component;
 use volpack::stages::flatten::flatten;
-use volpack::stages::select::find;
-use volpack::vdb::VdbFile;
+use volpack::vdb::{VdbFile, find_grid};
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -86,7 +85,7 @@ fn bricks(args: &Args) -> Result<Array2<f32>, Box<dyn Error>> {
     let (mut values, mut peak) = (Vec::new(), 0.0f32);
     for path in volpack::manifest::expand(&args.files)? {
         let file = VdbFile::open(&path)?;
-        let info = find(&file.grids, &args.grid).ok_or("no such grid")?;
+        let info = find_grid(&file.grids, &args.grid).ok_or("no such grid")?;
         let frame = flatten(&file, &path, info, Component::Whole, NonFinite::Refuse)?.frame;
         peak = peak.max(frame.stats.active_range.map_or(0.0, |r| r.max));
         values.extend(frame.bricks.iter().flat_map(|b| b.values));

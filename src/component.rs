@@ -4,8 +4,7 @@
 //! becomes several grids of 24 bits each, which together give every value back exactly.
 
 use crate::settings::Integers;
-use crate::stages::select::find;
-use crate::vdb::{GridInfo, Scalar, ValueType};
+use crate::vdb::{GridInfo, Scalar, ValueType, find_grid};
 
 /// Bits of a part: as many as an `f32` holds of any integer.
 const PART_BITS: u32 = 24;
@@ -80,12 +79,12 @@ pub fn find_packed<'a>(
 ) -> Option<(&'a GridInfo, Component)> {
     let part = || {
         let (base, _) = name.rsplit_once('.').filter(|_| integers == Integers::Split)?;
-        let info = find(grids, base)?;
+        let info = find_grid(grids, base)?;
         let (_, part) =
             parts(&info.value_type).iter().find(|(suffix, _)| name.strip_prefix(base) == Some(suffix))?;
         Some((info, *part))
     };
-    part().or_else(|| Some((find(grids, name)?, Component::Whole)))
+    part().or_else(|| Some((find_grid(grids, name)?, Component::Whole)))
 }
 
 #[cfg(test)]
