@@ -2,7 +2,7 @@
 
 use super::Progress;
 use crate::error::{Error, Result};
-use crate::settings::{Format, Integers, Quality, Settings, whole_range};
+use crate::settings::{Encoding, Integers, Quality, Settings, whole_range};
 use crate::stages::allocate::{self, AdaptiveGrid, AllocateError, Target};
 use crate::stages::encodings::{ConstantAim, Encodings, GridCache, Terms};
 use crate::stages::serialise::{GridInput, SerialiseError, gpu_bytes, tree_bytes};
@@ -27,10 +27,11 @@ pub(super) fn allocate(
             ))
         })?);
     }
-    match settings.format.codec() {
-        Some(codec) => {
+    match &settings.encoding {
+        Encoding::Uniform { codec, clustering } => {
+            let codec = codec.codec();
             for (grid, encodings) in grids.iter_mut().zip(encodings) {
-                grid.allocation = Some(match &settings.clustering {
+                grid.allocation = Some(match clustering {
                     None => allocate::uniform(&grid.tree, encodings, codec),
                     Some(clustering) => {
                         progress.stage("cluster", grid.tree.pool.len().into(), "bricks");
@@ -41,7 +42,7 @@ pub(super) fn allocate(
             }
             Ok(())
         }
-        None => adaptive(grids, encodings, settings, progress),
+        Encoding::Adaptive { .. } => adaptive(grids, encodings, settings, progress),
     }
 }
 
@@ -51,14 +52,14 @@ fn adaptive(
     settings: &Settings,
     progress: &mut dyn Progress,
 ) -> Result<()> {
-    let size = match settings.quality {
+    let size = match settings.quality() {
         Quality::Size(bytes) => Some(bytes),
         Quality::BitsPerVoxel(bits) => Some((bits * 64.0 * leaves(grids) as f64) as u64),
         _ => None,
     };
     let target = Target {
         size,
-        min_frame_psnr: settings.min_frame_psnr,
+        min_frame_psnr: settings.min_frame_psnr(),
         fixed_bytes: if size.is_some() { bytes(grids, tree_bytes)? } else { 0 },
     };
     let bricks: u64 = grids.iter().map(|g| u64::from(g.tree.pool.len())).sum();
@@ -81,7 +82,7 @@ fn adaptive(
     let allocations = allocate::adaptive(candidates, &target, &mut |bricks| progress.advance(bricks));
     let allocations = allocations.map_err(|e| allocate_error(e, &grids[0]))?;
     grids.iter_mut().zip(allocations).for_each(|(grid, allocation)| grid.allocation = Some(allocation));
-    check_size(grids, settings.quality)
+    check_size(grids, settings.quality())
 }
 
 /// A level set whose distances keep a bound keeps its signs where the surface is further than this part of it: its surface
@@ -89,7 +90,7 @@ fn adaptive(
 const SIGNED_PART_OF_BOUND: f64 = 0.2;
 
 fn terms(grid: &GridInput, settings: &Settings) -> Terms {
-    let is_adaptive = settings.format == Format::Adaptive;
+    let is_adaptive = settings.is_adaptive();
     let (quality, voxel_size) = (quality(grid, settings), smallest_voxel(grid));
     let sign_matters = verify::SIGN_MATTERS_VOXELS * voxel_size;
     let (aim, sign_matters) = match quality {
@@ -131,7 +132,7 @@ fn peak(grid: &GridInput) -> f64 {
 
 /// What is asked of a grid.
 fn quality(grid: &GridInput, settings: &Settings) -> Quality {
-    settings.quality.of_grid(grid.class, peak(grid), smallest_voxel(grid))
+    settings.quality().of_grid(grid.class, peak(grid), smallest_voxel(grid))
 }
 
 fn smallest_voxel(grid: &GridInput) -> f64 {

@@ -19,7 +19,7 @@ use crate::pack::{FinishedPack, Grid, Pack, Provenance, Source};
 use crate::report::PackSummary;
 pub use crate::report::model::Made;
 use crate::report::model::{BuildReport, StageSeconds};
-use crate::settings::{Format, NOT_WITH_ADAPTIVE, Settings};
+use crate::settings::{Format, Settings};
 use crate::stages::metadata::{self, Digests, SequenceInfo};
 use crate::stages::quantise::QuantiseError;
 use crate::stages::select::{Selection, select};
@@ -262,9 +262,6 @@ struct Plan {
 /// Stages 1 and 2, and what they found odd.
 fn plan(job: &Job, progress: &mut dyn Progress) -> Result<(Plan, Vec<String>)> {
     check_output(job)?;
-    if job.settings.format == Format::Adaptive && job.settings.clustering.is_some() {
-        return Err(Error::Usage(NOT_WITH_ADAPTIVE.to_owned()));
-    }
     progress.stage("metadata", job.frames.len() as u64, "files");
     let digests = Digests { cache: job.cache.as_deref(), paranoid: job.paranoid };
     let sequence = metadata::read(&job.frames, digests)?;
@@ -401,7 +398,7 @@ impl Clock {
 }
 
 fn provenance(sequence: &SequenceInfo, settings: &Settings) -> Provenance {
-    let uses_block_encoder = matches!(settings.format, Format::Bc4 | Format::Bc7 | Format::Adaptive);
+    let uses_block_encoder = matches!(settings.format(), Format::Bc4 | Format::Bc7 | Format::Adaptive);
     Provenance {
         tool: env!("CARGO_PKG_NAME").to_owned(),
         version: env!("CARGO_PKG_VERSION").to_owned(),

@@ -139,7 +139,8 @@ fn grids(sequence: &Sequence) -> Result<Vec<Grid>, VolpackError> {
 
 /// What every grid is packed at: what is asked for, and its name.
 fn settings(half_of_default: Option<u64>) -> Vec<(String, Settings)> {
-    let quality = |name: String, quality| (name, Settings { quality, ..Settings::default() });
+    let quality =
+        |name: String, quality: Quality| (name, Settings { encoding: quality.into(), ..Settings::default() });
     let mut all = Vec::new();
     all.extend((35..=65).step_by(5).map(|db| quality(format!("psnr {db}"), Quality::Psnr(db.into()))));
     all.extend(
@@ -149,7 +150,9 @@ fn settings(half_of_default: Option<u64>) -> Vec<(String, Settings)> {
     all.extend(half_of_default.map(|size| quality("half the size".to_owned(), Quality::Size(size))));
     all.push(quality("1 bit a voxel".to_owned(), Quality::BitsPerVoxel(1.0)));
     let uniform = Format::ALL.into_iter().filter(|format| format.codec().is_some());
-    all.extend(uniform.map(|format| (format.name().to_owned(), Settings { format, ..Settings::default() })));
+    all.extend(uniform.map(|format| {
+        (format.name().to_owned(), Settings { encoding: format.into(), ..Settings::default() })
+    }));
     all
 }
 
@@ -214,11 +217,11 @@ fn end(job: &Job, grid: &Grid) -> End {
 
 /// Why a refusal is right: the list of what no setting of volpack can pack, or not at what was asked.
 fn reason(job: &Job, grid: &Grid, why: &str) -> Option<&'static str> {
-    let format = job.settings.format;
+    let format = job.settings.format();
     let is_uniform = format.codec().is_some();
     let is_blocks = matches!(format, Format::Bc4 | Format::Bc7);
     let is_bytes = is_blocks || format == Format::Unorm8;
-    let asks_for_bytes = job.settings.quality.is_size() && !is_uniform;
+    let asks_for_bytes = job.settings.quality().is_size() && !is_uniform;
     let list = [
         (
             asks_for_bytes && why.contains("cannot be reached, the least is"),
