@@ -27,7 +27,7 @@
 //! use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 //! use volpack::settings::{Format, Settings};
 //!
-//! let settings = Settings { format: Format::Bc7, ..Settings::default() };
+//! let settings = Settings { encoding: Format::Bc7.into(), ..Settings::default() };
 //! let job = Job::new(vec!["smoke.vdb".into()], "smoke.volpack".into(), settings, VerifyLevel::All);
 //! let outcome = build(&job, &mut Silent)?;
 //! assert!(outcome.verification.is_some_and(|report| report.ok));

@@ -3,13 +3,12 @@
 use std::collections::BTreeMap;
 use std::path::{Component, Path, PathBuf};
 
-use serde::Deserialize;
+use serde::{Deserialize, Deserializer};
+use toml::Spanned;
+use toml::de::{DeTable, DeValue};
 
 use crate::error::{Error, Result};
-use crate::settings::{
-    Budget, ByteSize, ClusterArgs, DEFAULT_ZSTD, Dedup, ErrorBound, Format, Integers, Masks, NonFinite,
-    QualityArgs, RangeMode, Settings,
-};
+use crate::settings::{Budget, Settings, SettingsArgs, check_above_zero};
 
 /// The manifest's name where none is given.
 pub const DEFAULT_NAME: &str = "pipeline.toml";
@@ -47,36 +46,14 @@ struct RawManifest {
     budget: Budget,
 }
 
+/// What an asset has beside its settings.
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct RawAsset {
     frames: OneOrMany,
     grid: Option<String>,
-    grids: Option<Vec<String>>,
-    #[serde(default)]
-    format: Format,
-    psnr: Option<f64>,
-    max_error: Option<ErrorBound>,
-    bits_per_voxel: Option<f64>,
-    size: Option<ByteSize>,
-    min_frame_psnr: Option<f64>,
-    #[serde(default)]
-    dedup: Dedup,
-    clusters: Option<u32>,
-    iterations: Option<u32>,
-    variance: Option<f64>,
-    seed: Option<u64>,
-    #[serde(default)]
-    range: RangeMode,
-    #[serde(default)]
-    masks: Masks,
-    #[serde(default)]
-    nonfinite: NonFinite,
-    #[serde(default)]
-    integers: Integers,
-    zstd: Option<toml::Spanned<i32>>,
-    fps: Option<toml::Spanned<f32>>,
-    max_flip: Option<toml::Spanned<f64>>,
+    #[serde(default, deserialize_with = "checked_max_flip")]
+    max_flip: Option<f64>,
     output: Option<PathBuf>,
     #[serde(default)]
     budget: Budget,
@@ -101,12 +78,21 @@ impl Manifest {
     }
 
     fn parse(text: &str, folder: &Path) -> Result<Self, String> {
-        let raw: RawManifest = toml::from_str(text).map_err(|e| describe(text, &e))?;
-        let assets = raw
-            .asset
-            .into_iter()
-            .map(|(name, asset)| Ok((name.clone(), asset.into_asset(&name, &raw.budget, text, folder)?)))
-            .collect::<Result<_, String>>()?;
+        let described = |e| describe(text, &e);
+        let mut document = DeTable::parse(text).map_err(described)?;
+        let mut settings = take_settings(document.get_mut());
+        let raw = RawManifest::deserialize(toml::Deserializer::from(document)).map_err(described)?;
+        let asset = |(name, asset): (String, RawAsset)| {
+            let settings = match settings.remove(&name) {
+                Some(table) => {
+                    SettingsArgs::deserialize(toml::Deserializer::from(table)).map_err(described)?
+                }
+                None => SettingsArgs::default(),
+            };
+            let asset = asset.into_asset(&name, settings, &raw.budget, folder);
+            Ok((name.clone(), asset.map_err(|e| format!("asset {name:?}: {e}"))?))
+        };
+        let assets = raw.asset.into_iter().map(asset).collect::<Result<_, String>>()?;
         Ok(Self { assets, budget: raw.budget })
     }
 
@@ -122,48 +108,51 @@ impl Manifest {
     }
 }
 
+/// Takes the settings out of every asset, by its name. They are read on their own, and not by serde's `flatten`, which
+/// forgets where a value stands and which keys there are.
+fn take_settings<'a>(document: &mut DeTable<'a>) -> BTreeMap<String, Spanned<DeTable<'a>>> {
+    let keys = SettingsArgs::keys();
+    let mut settings = BTreeMap::new();
+    let assets = document.get_mut("asset").and_then(|assets| table_of(assets.get_mut()));
+    for (name, asset) in assets.into_iter().flatten() {
+        let span = asset.span();
+        let Some(asset) = table_of(asset.get_mut()) else { continue };
+        let mut taken = DeTable::new();
+        for (key, value) in std::mem::take(asset) {
+            let is_setting = keys.iter().any(|known| known == key.get_ref());
+            if is_setting { &mut taken } else { &mut *asset }.insert(key, value);
+        }
+        settings.insert(name.get_ref().to_string(), Spanned::new(span, taken));
+    }
+    settings
+}
+
+fn table_of<'d, 'a>(value: &'d mut DeValue<'a>) -> Option<&'d mut DeTable<'a>> {
+    match value {
+        DeValue::Table(table) => Some(table),
+        _ => None,
+    }
+}
+
+fn checked_max_flip<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<f64>, D::Error> {
+    let flip = check_above_zero(f64::deserialize(deserializer)?);
+    flip.map(Some).map_err(|_| serde::de::Error::custom("max_flip is a number above 0"))
+}
+
 impl RawAsset {
-    fn into_asset(self, name: &str, all: &Budget, text: &str, folder: &Path) -> Result<Asset, String> {
-        let grids = match (self.grid, self.grids) {
-            (Some(_), Some(_)) => return Err(format!("asset {name:?}: give grid or grids, not both")),
-            (Some(grid), None) => vec![grid],
-            (None, grids) => grids.unwrap_or_default(),
-        };
-        let zstd = match self.zstd {
-            Some(level) if !(0..=22).contains(level.get_ref()) => {
-                return Err(at_line(text, level.span().start, "zstd is a level from 1 to 22, or 0 for none"));
+    fn into_asset(
+        self,
+        name: &str,
+        mut settings: SettingsArgs,
+        all: &Budget,
+        folder: &Path,
+    ) -> Result<Asset, String> {
+        if let Some(grid) = self.grid {
+            if settings.grids.is_some() {
+                return Err("give grid or grids, not both".to_owned());
             }
-            level => level.map_or(DEFAULT_ZSTD, toml::Spanned::into_inner),
-        };
-        let fps = match self.fps {
-            Some(fps) if !(fps.get_ref().is_finite() && *fps.get_ref() > 0.0) => {
-                return Err(at_line(text, fps.span().start, "fps is a number above 0"));
-            }
-            fps => fps.map(toml::Spanned::into_inner),
-        };
-        let max_flip = match self.max_flip {
-            Some(flip) if !(flip.get_ref().is_finite() && *flip.get_ref() > 0.0) => {
-                return Err(at_line(text, flip.span().start, "max_flip is a number above 0"));
-            }
-            flip => flip.map(toml::Spanned::into_inner),
-        };
-        let adaptive = QualityArgs {
-            psnr: self.psnr,
-            max_error: self.max_error,
-            bits_per_voxel: self.bits_per_voxel,
-            size: self.size,
-            min_frame_psnr: self.min_frame_psnr,
-        };
-        let clusters = ClusterArgs {
-            dedup: Some(self.dedup),
-            clusters: self.clusters,
-            iterations: self.iterations,
-            variance: self.variance,
-            seed: self.seed,
-        };
-        let in_asset = |e: String| format!("asset {name:?}: {e}");
-        let quality = adaptive.quality(self.format).map_err(in_asset)?;
-        let clustering = clusters.clustering(self.format).map_err(in_asset)?;
+            settings.grids = Some(vec![grid]);
+        }
         let frames = match self.frames {
             OneOrMany::One(one) => vec![one],
             OneOrMany::Many(many) => many,
@@ -172,21 +161,9 @@ impl RawAsset {
         Ok(Asset {
             frames: frames.into_iter().map(|f| folder.join(f)).collect(),
             output: folder.join(output),
-            max_flip,
+            max_flip: self.max_flip,
             budget: all.of_asset(&self.budget),
-            settings: Settings {
-                grids,
-                format: self.format,
-                quality,
-                min_frame_psnr: self.min_frame_psnr,
-                clustering,
-                range: self.range,
-                masks: self.masks,
-                nonfinite: self.nonfinite,
-                integers: self.integers,
-                zstd,
-                fps,
-            },
+            settings: settings.settings()?,
         })
     }
 }
@@ -201,8 +178,12 @@ fn describe(text: &str, error: &toml::de::Error) -> String {
     // serde lists the known keys of a place in backticks behind the unknown one.
     let quoted: Vec<&str> = message.split('`').skip(1).step_by(2).collect();
     if let (true, [unknown, known @ ..]) = (message.starts_with("unknown "), &quoted[..]) {
+        // An asset's settings were taken out of it.
+        let settings = if known.contains(&"frames") { SettingsArgs::keys() } else { Vec::new() };
         let nearest = known
             .iter()
+            .copied()
+            .chain(settings.iter().map(String::as_str))
             .max_by(|a, b| strsim::jaro_winkler(unknown, a).total_cmp(&strsim::jaro_winkler(unknown, b)));
         if let Some(nearest) = nearest {
             message = format!("unknown {} `{unknown}`: did you mean `{nearest}`?", what_is_unknown(&message));

@@ -15,7 +15,9 @@ use volpack::cli::exit_code;
 use volpack::error::Error;
 use volpack::pack::{Pack, Region};
 use volpack::pipeline::{Job, Outcome, Silent, VerifyLevel, build};
-use volpack::settings::{Clustering, FRAME_MARGIN_DB, Format, NonFinite, Quality, Settings};
+use volpack::settings::{
+    Clustering, Encoding, FRAME_MARGIN_DB, Format, NonFinite, Quality, Settings, UniformCodec,
+};
 use volpack::sweep::{Options, stability};
 use volpack::vdb::{Tree, VdbFile};
 use volpack::verify::{Sources, VerifyReport, voxels};
@@ -48,7 +50,17 @@ impl Case {
     }
 
     fn settings(&self, quality: Quality) -> Settings {
-        Settings { grids: self.grids.clone(), quality, ..Settings::default() }
+        Settings { grids: self.grids.clone(), encoding: quality.into(), ..Settings::default() }
+    }
+
+    fn with_floor(&self, quality: Quality, min_frame_psnr: Option<f64>) -> Settings {
+        let encoding = Encoding::Adaptive { quality, min_frame_psnr };
+        Settings { grids: self.grids.clone(), encoding, ..Settings::default() }
+    }
+
+    fn clustered(&self, clustering: Clustering) -> Settings {
+        let encoding = Encoding::Uniform { codec: UniformCodec::Bc7, clustering: Some(clustering) };
+        Settings { grids: self.grids.clone(), encoding, ..Settings::default() }
     }
 
     /// The largest fixture.
@@ -77,7 +89,7 @@ impl Case {
 
     /// Builds a pack that has to verify.
     fn build(&self, settings: Settings, folder: &Path) -> Built {
-        let what = format!("{} {:?} {:?} {}", self.name, self.grids, settings.format, settings.quality);
+        let what = format!("{} {:?} {:?} {}", self.name, self.grids, settings.format(), settings.quality());
         let outcome = self.attempt(settings, folder).unwrap_or_else(|e| panic!("{what}: {e}"));
         let report = outcome.verification.unwrap();
         assert!(report.ok, "{what}: {:?}", report.failures);
@@ -89,7 +101,7 @@ impl Case {
 
     /// The same of a pack of which so little may be left that verification says that it is ruined, and nothing else.
     fn build_unverified(&self, settings: Settings, folder: &Path) -> Built {
-        let what = format!("{} {:?} {:?} {}", self.name, self.grids, settings.format, settings.quality);
+        let what = format!("{} {:?} {:?} {}", self.name, self.grids, settings.format(), settings.quality());
         let job = Job::new(self.frames.clone(), folder.join("test.volpack"), settings, VerifyLevel::None);
         let outcome = build(&job, &mut Silent).unwrap_or_else(|e| panic!("{what}: {e}"));
         let bytes = std::fs::read(&job.output).unwrap();
@@ -185,7 +197,7 @@ fn no_frame_falls_below_its_floor() {
     let folder = tempfile::tempdir().unwrap();
     let case = Case::animation(&["temperature"]);
     let worst = |quality, min_frame_psnr| {
-        let settings = Settings { min_frame_psnr, ..case.settings(quality) };
+        let settings = case.with_floor(quality, min_frame_psnr);
         case.build(settings, folder.path()).worst_frame()
     };
     // Small puffs of which one brick is much: were there no floor, some would pay for the others.
@@ -200,7 +212,7 @@ fn no_frame_falls_below_its_floor() {
     assert!(free < 52.0, "{free} without a floor shows nothing");
     assert!(worst(size, Some(52.0)) >= 52.0);
     // The floor is part of the least size that is named.
-    let with_floor = |size| Settings { min_frame_psnr: Some(38.0), ..case.settings(Quality::Size(size)) };
+    let with_floor = |size| case.with_floor(Quality::Size(size), Some(38.0));
     let least = least(&case.attempt(with_floor(1), folder.path()).err().unwrap());
     let built = case.build(with_floor(least), folder.path());
     assert!(built.worst_frame() >= 38.0 && built.gpu_bytes <= least, "{} bytes", built.gpu_bytes);
@@ -212,7 +224,7 @@ fn the_floor_that_nobody_named_helps_the_worst_frame() {
     let case = Case::animation(&["temperature"]);
     for size in [10_000, 10_500, 11_500] {
         let [free, default] = [Some(0.0), None].map(|min_frame_psnr| {
-            let settings = Settings { min_frame_psnr, ..case.settings(Quality::Size(size)) };
+            let settings = case.with_floor(Quality::Size(size), min_frame_psnr);
             case.build(settings, folder.path()).worst_frame()
         });
         assert!(default >= free, "{size} bytes: {default} dB with a floor, {free} without");
@@ -369,23 +381,23 @@ fn the_order_of_frames_hardly_matters() {
 #[test]
 fn adverse_bricks_are_packed_in_every_way() {
     let folder = tempfile::tempdir().unwrap();
-    let clustering = Some(Clustering { clusters: 4, variance: 1.0, ..Clustering::default() });
+    let clustering = Clustering { clusters: 4, variance: 1.0, ..Clustering::default() };
     let mut failed = Vec::new();
     for name in ["degenerate", "adversarial"] {
         for grid in VdbFile::open(&fixture(&format!("{name}.vdb"))).unwrap().grids {
             let case = Case::of(name, &[&grid.name]);
             let default = case.settings(Quality::default());
-            let mut ways = vec![
-                default.clone(),
-                case.settings(max_error("0.01")),
-                Settings { format: Format::Bc7, clustering, ..default.clone() },
-            ];
+            let mut ways =
+                vec![default.clone(), case.settings(max_error("0.01")), case.clustered(clustering)];
             let uniform = Format::ALL.into_iter().filter(|format| format.codec().is_some());
-            ways.extend(uniform.map(|format| Settings { format, ..default.clone() }));
+            ways.extend(uniform.map(|format| Settings { encoding: format.into(), ..default.clone() }));
             for settings in ways {
                 let what = format!(
                     "{name} {} {:?} {} {:?}",
-                    grid.name, settings.format, settings.quality, settings.clustering
+                    grid.name,
+                    settings.format(),
+                    settings.quality(),
+                    settings.clustering()
                 );
                 let built = catch_unwind(AssertUnwindSafe(|| case.attempt(settings.clone(), folder.path())));
                 let Ok(built) = built else {
@@ -393,7 +405,7 @@ fn adverse_bricks_are_packed_in_every_way() {
                     continue;
                 };
                 // Half floats end at 65,504.
-                let too_large = settings.format == Format::F16 && grid.name == "huge_range";
+                let too_large = settings.format() == Format::F16 && grid.name == "huge_range";
                 match built {
                     Err(error) if too_large => {
                         assert_eq!(exit_code::of(&error), 3, "{what}: {error}");
@@ -404,13 +416,13 @@ fn adverse_bricks_are_packed_in_every_way() {
                         assert!(!too_large, "{what}: packed");
                         let report = outcome.verification.unwrap();
                         // Blocks of noise are noise, and the smallest floats are nothing to a half.
-                        let is_uniform = settings.format != Format::Adaptive;
+                        let is_uniform = settings.format() != Format::Adaptive;
                         if is_uniform && report.failures.iter().all(|why| is_ruined(why)) {
                             continue;
                         }
                         if !report.ok {
                             failed.push(format!("{what}: {:?}", report.failures));
-                        } else if matches!(settings.quality, Quality::MaxError(_)) {
+                        } else if matches!(settings.quality(), Quality::MaxError(_)) {
                             let pack = Pack::open(&folder.path().join("test.volpack")).unwrap();
                             let errors = largest_errors(&case, &pack);
                             if errors[0] > 0.01 {
@@ -440,7 +452,7 @@ fn values_too_far_apart_are_refused() {
         bytes[places[1]..][..4].copy_from_slice(&other.to_le_bytes());
         std::fs::write(&case.frames[0], &bytes).unwrap();
         for format in Format::ALL {
-            let settings = Settings { format, ..case.settings(Quality::default()) };
+            let settings = Settings { encoding: format.into(), ..case.settings(Quality::default()) };
             if !refused && format != Format::F16 {
                 case.build(settings, folder.path());
                 continue;
@@ -458,12 +470,9 @@ fn clusters_are_no_more_than_asked_and_the_same_on_any_number_of_threads() {
     let folder = tempfile::tempdir().unwrap();
     for case in [Case::fog(), Case::animation(&["density", "temperature"])] {
         for (clusters, seed) in [(1, 0), (4, 0), (4, 1), (4, 2), (100, 0), (u32::MAX, 7)] {
-            let settings = Settings {
-                format: Format::Bc7,
-                // No brick varies more than this: all are clustered.
-                clustering: Some(Clustering { clusters, variance: 1.0, seed, ..Clustering::default() }),
-                ..case.settings(Quality::default())
-            };
+            // No brick varies more than this: all are clustered.
+            let settings =
+                case.clustered(Clustering { clusters, variance: 1.0, seed, ..Clustering::default() });
             let built = case.build_unverified(settings.clone(), folder.path());
             for g in 0..built.pack.grids.len() {
                 let mut shapes = HashSet::new();
@@ -483,16 +492,6 @@ fn clusters_are_no_more_than_asked_and_the_same_on_any_number_of_threads() {
             }
         }
     }
-}
-
-#[test]
-fn clusters_are_refused_with_the_adaptive_format() {
-    let folder = tempfile::tempdir().unwrap();
-    let case = Case::fog();
-    let settings = Settings { clustering: Some(Clustering::default()), ..case.settings(Quality::default()) };
-    let error = case.attempt(settings, folder.path()).err().unwrap();
-    assert_eq!(exit_code::of(&error), 2, "{error}");
-    assert!(error.to_string().contains("adaptive"), "{error}");
 }
 
 /// What is said of a pack that claims another quality than it was built for.
@@ -525,7 +524,7 @@ fn a_promise_that_was_not_kept_is_found() {
     let found = forged(&case, &pack, "\"psnr\": 45.0", "\"psnr\": 48.0");
     assert!(found.iter().any(|f| f.contains("below the 48 dB that were asked")), "{found:?}");
 
-    let pack = built(Settings { min_frame_psnr: Some(40.0), ..case.settings(Quality::Psnr(45.0)) });
+    let pack = built(case.with_floor(Quality::Psnr(45.0), Some(40.0)));
     let found = forged(&case, &pack, "\"min_frame_psnr\": 40.0", "\"min_frame_psnr\": 80.0");
     assert!(found.iter().any(|f| f.contains("below the 80 dB minimum")), "{found:?}");
 }

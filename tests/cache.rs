@@ -13,7 +13,7 @@ use serde_json::Value as Json;
 use volpack::cache::Cache;
 use volpack::pipeline::{Job, Made, Outcome, Progress, Silent, VerifyLevel, build};
 use volpack::settings::{
-    ClusterArgs, Dedup, ErrorBound, Format, Masks, NonFinite, Quality, RangeMode, Settings,
+    Clustering, Encoding, ErrorBound, Format, Masks, NonFinite, Quality, RangeMode, Settings, UniformCodec,
 };
 
 /// A folder with a cache and the frames of an animation that may be edited.
@@ -73,15 +73,15 @@ fn files(folder: &Path) -> Vec<PathBuf> {
 }
 
 fn of_quality(quality: Quality) -> Settings {
-    Settings { grids: vec!["density".to_owned()], quality, ..Settings::default() }
+    Settings { grids: vec!["density".to_owned()], encoding: quality.into(), ..Settings::default() }
 }
 
 fn of_format(format: Format) -> Settings {
-    Settings { format, quality: Quality::default(), ..of_quality(Quality::default()) }
+    Settings { encoding: format.into(), ..of_quality(Quality::default()) }
 }
 
-fn clusters() -> ClusterArgs {
-    ClusterArgs { dedup: Some(Dedup::Kmeans), clusters: Some(8), ..ClusterArgs::default() }
+fn clustered(clustering: Clustering) -> Encoding {
+    Encoding::Uniform { codec: UniformCodec::Bc7, clustering: Some(clustering) }
 }
 
 /// Settings that share parts of each other's work in every way.
@@ -92,7 +92,10 @@ fn variety() -> Vec<Settings> {
         psnr(60.0),
         psnr(30.0),
         psnr(46.0),
-        Settings { min_frame_psnr: Some(50.0), ..psnr(50.0) },
+        Settings {
+            encoding: Encoding::Adaptive { quality: Quality::Psnr(50.0), min_frame_psnr: Some(50.0) },
+            ..psnr(50.0)
+        },
         of_quality(Quality::MaxError(ErrorBound::of_range(0.01))),
         of_quality(Quality::Size(60_000)),
         Settings { grids: vec!["density".to_owned(), "temperature".to_owned()], ..psnr(45.0) },
@@ -108,7 +111,10 @@ fn variety() -> Vec<Settings> {
         of_format(Format::F16),
         Settings { zstd: 7, ..of_format(Format::F16) },
         of_format(Format::F32),
-        Settings { clustering: clusters().clustering(Format::Bc7).unwrap(), ..of_format(Format::Bc7) },
+        Settings {
+            encoding: clustered(Clustering { clusters: 8, ..Clustering::default() }),
+            ..of_format(Format::Bc7)
+        },
     ]
 }
 
@@ -209,9 +215,8 @@ fn a_verification_is_made_once_and_failures_each_time() {
     assert_eq!(json(&first), json(&second));
 
     // One shape for all bricks of a level set flips signs.
-    let one = ClusterArgs { clusters: Some(1), variance: Some(1.0), ..clusters() };
-    let clustering = one.clustering(Format::Bc7).unwrap();
-    let flips = Settings { grids: vec!["surface".to_owned()], clustering, ..of_format(Format::Bc7) };
+    let encoding = clustered(Clustering { clusters: 1, variance: 1.0, ..Clustering::default() });
+    let flips = Settings { grids: vec!["surface".to_owned()], encoding, ..Settings::default() };
     for _ in 0..2 {
         let outcome = verified(&flips, &[fixture("levelset_half.vdb")]);
         assert!(!outcome.was_verified && !outcome.verification.unwrap().ok);

@@ -22,7 +22,7 @@ use volpack::codec::Codec;
 use volpack::pack::layout::{AtlasRecord, FrameRecord, kind};
 use volpack::pack::tree::{L3Record, header};
 use volpack::pack::{Atlas, Pack, Region};
-use volpack::settings::{Clustering, Format, Quality, Settings};
+use volpack::settings::{Clustering, Encoding, Format, Quality, Settings, UniformCodec};
 use volpack::vdb::{Accessor, Scalar, VdbFile, with_scalar_type};
 use volpack::volume::{BRICK_DIM, CELL_DIM, Coord, CoordBox};
 
@@ -36,9 +36,9 @@ struct Case {
 }
 
 fn cases() -> Vec<Case> {
-    let settings = |grids: &[&str], format, zstd| Settings {
+    let settings = |grids: &[&str], format: Format, zstd| Settings {
         grids: grids.iter().map(|grid| (*grid).to_owned()).collect(),
-        format,
+        encoding: format.into(),
         zstd,
         ..Settings::default()
     };
@@ -57,13 +57,16 @@ fn cases() -> Vec<Case> {
         case(
             "adaptive",
             &["adversarial"],
-            Settings { quality: Quality::Psnr(60.0), ..settings(shapes, Format::Adaptive, 0) },
+            Settings { encoding: Quality::Psnr(60.0).into(), ..settings(shapes, Format::Adaptive, 0) },
         ),
         case(
             "kmeans",
             &["anim_0003", "anim_0004", "anim_0005", "anim_0006"],
             Settings {
-                clustering: Some(Clustering { clusters: 4, ..Clustering::default() }),
+                encoding: Encoding::Uniform {
+                    codec: UniformCodec::Bc7,
+                    clustering: Some(Clustering { clusters: 4, ..Clustering::default() }),
+                },
                 ..settings(&["density"], Format::Bc7, 0)
             },
         ),

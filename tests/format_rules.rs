@@ -448,7 +448,7 @@ fn two_bricks(places: [Coord; 2]) -> Pack {
     source.leaves = places.map(|at| (at, (values, Mask512::ALL))).into();
     let path = folder.path().join("two.vdb");
     vdb_writer::write_grid(&path, &source);
-    let settings = Settings { format: Format::F32, ..Settings::default() };
+    let settings = Settings { encoding: Format::F32.into(), ..Settings::default() };
     let (pack, report) = build_verified(&[path], settings, folder.path());
     assert!(report.ok, "{:?}", report.failures);
     pack

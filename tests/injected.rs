@@ -28,7 +28,12 @@ impl Victim {
     }
 
     fn of(sources: Vec<PathBuf>, grid: &str, format: Format, folder: &Path) -> Self {
-        let settings = Settings { grids: vec![grid.to_owned()], format, zstd: 0, ..Settings::default() };
+        let settings = Settings {
+            grids: vec![grid.to_owned()],
+            encoding: format.into(),
+            zstd: 0,
+            ..Settings::default()
+        };
         let (_, report) = build_verified(&sources, settings, folder);
         assert!(report.ok);
         let victim = Self { bytes: std::fs::read(folder.join("test.volpack")).unwrap(), sources };

@@ -22,7 +22,7 @@ use volpack::volume::Coord;
 fn settings(grid: &str, format: Format) -> Settings {
     Settings {
         grids: vec![grid.to_owned()],
-        format,
+        encoding: format.into(),
         nonfinite: NonFinite::Zero,
         integers: Integers::Nearest,
         ..Settings::default()
@@ -77,7 +77,7 @@ fn integers_of_any_size_are_kept_by_halves_or_refused() {
         assert!(error.to_string().contains("integers = \"split\""), "{error}");
 
         for format in [Format::F32, Format::Adaptive] {
-            let split = Settings { integers: Integers::Split, format, ..keep.clone() };
+            let split = Settings { integers: Integers::Split, encoding: format.into(), ..keep.clone() };
             let (pack, report) = build_verified(std::slice::from_ref(&path), split, folder.path());
             assert!(report.ok, "{name}: {:?}", report.failures);
             assert!(report.all.max_error < 0.5, "{name}: {}", report.all.max_error);
@@ -122,7 +122,7 @@ fn labels_stay_labels() {
         }
     });
     // A format that cannot keep them says so.
-    let bc7 = Settings { format: Format::Bc7, ..default.clone() };
+    let bc7 = Settings { encoding: Format::Bc7.into(), ..default.clone() };
     let (_, report) = unverified(&path, bc7.clone(), folder.path());
     assert!(report.failures.iter().any(|why| why.contains("integer")), "{:?}", report.failures);
     let nearest = Settings { integers: Integers::Nearest, ..bc7 };
@@ -313,7 +313,7 @@ fn several_grids_keep_their_own_frames_and_ranges() {
     let folder = tempfile::tempdir().unwrap();
     let settings = Settings {
         grids: vec!["temperature".to_owned(), "density".to_owned()],
-        format: Format::Unorm8,
+        encoding: Format::Unorm8.into(),
         fps: Some(24.0),
         ..Settings::default()
     };

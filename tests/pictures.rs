@@ -43,7 +43,7 @@ fn write(folder: &Path, frames: &[GridFile<f32>]) -> Vec<PathBuf> {
 }
 
 fn settings(format: Format) -> Settings {
-    Settings { format, ..Settings::default() }
+    Settings { encoding: format.into(), ..Settings::default() }
 }
 
 fn built(frames: &[PathBuf], settings: Settings, folder: &Path) -> Pack {
@@ -97,7 +97,8 @@ fn a_still_ball_stands_still_whatever_its_box_does() {
     ];
     let frames = write(folder.path(), &frames);
     // What a lossy pack drops must not move the camera either.
-    for settings in [settings(Format::F32), Settings { quality: Quality::Psnr(30.0), ..Settings::default() }]
+    for settings in
+        [settings(Format::F32), Settings { encoding: Quality::Psnr(30.0).into(), ..Settings::default() }]
     {
         let pack = built(&frames, settings, folder.path());
         let shot = |f: usize| {
@@ -268,7 +269,8 @@ fn faint_fog_is_seen_and_what_is_blank_is_said() {
     let found = ring(&pack, &frames);
     assert_eq!((found.pictures.len(), found.not_compared.len()), (1, 0), "{found:?}");
     // Without the haze the picture is another.
-    let lossy = Settings { quality: Quality::MaxError("0.01".parse().unwrap()), ..Settings::default() };
+    let lossy =
+        Settings { encoding: Quality::MaxError("0.01".parse().unwrap()).into(), ..Settings::default() };
     let found = ring(&built(&frames, lossy, folder.path()), &frames);
     assert!(found.pictures[0].source.flip > 0.02 && !found.warnings.is_empty(), "{found:?}");
     assert!(found.failures.is_empty(), "no limit was asked");
@@ -287,7 +289,7 @@ fn a_frame_whose_pack_is_empty_is_compared() {
         grid
     };
     let frames = write(folder.path(), &[ball(0.1, [0.0; 3], 3, [1.2; 3], 0.9), faint]);
-    let coarse = Settings { quality: Quality::Psnr(30.0), ..Settings::default() };
+    let coarse = Settings { encoding: Quality::Psnr(30.0).into(), ..Settings::default() };
     let pack = built(&frames, coarse, folder.path());
     assert!(pack.frame_tree(0, 1).bounds().is_empty(), "its haze was dropped");
     let found = ring(&pack, &frames);

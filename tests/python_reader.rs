@@ -57,7 +57,7 @@ fn a_reader_written_from_the_specification_sees_the_same_voxels() {
         for format in Format::ALL {
             // Python has no zstd of its own.
             let grids = grids.iter().map(|g| (*g).to_owned()).collect();
-            let settings = Settings { grids, format, zstd: 0, ..Settings::default() };
+            let settings = Settings { grids, encoding: format.into(), zstd: 0, ..Settings::default() };
             let (pack, _) = build_verified(&frames, settings, folder.path());
             let output = Command::new("python3")
                 .arg(&script)

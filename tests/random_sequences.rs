@@ -198,10 +198,10 @@ fn settings(rng: &mut Xoshiro256PlusPlus) -> Vec<Settings> {
         Quality::MaxError(max_error.to_string().parse().unwrap()),
         Quality::BitsPerVoxel(rng.gen_range(0.5..12.0)),
     ];
-    let adaptive = qualities.map(|quality| Settings { quality, ..Settings::default() });
+    let adaptive = qualities.map(|quality| Settings { encoding: quality.into(), ..Settings::default() });
     let uniform = Format::ALL[rng.gen_range(0..5)];
     let mut all = adaptive.to_vec();
-    all.push(Settings { format: uniform, ..Settings::default() });
+    all.push(Settings { encoding: uniform.into(), ..Settings::default() });
     for settings in &mut all {
         settings.range = [RangeMode::Brick, RangeMode::Brick, RangeMode::Sequence][rng.gen_range(0..3)];
         settings.masks = [Masks::Auto, Masks::Auto, Masks::Keep, Masks::Drop][rng.gen_range(0..4)];
@@ -212,10 +212,10 @@ fn settings(rng: &mut Xoshiro256PlusPlus) -> Vec<Settings> {
 
 /// Why a good pack may be refused all the same.
 fn may_be_refused(sequence: &Sequence, settings: &Settings, why: &str) -> bool {
-    let blocks = matches!(settings.format, Format::Unorm8 | Format::Bc4 | Format::Bc7);
+    let blocks = matches!(settings.format(), Format::Unorm8 | Format::Bc4 | Format::Bc7);
     let is_level_set = matches!(sequence.field, DecodedFrame::LevelSet);
     let is_little = ["cannot be reached, the least is", "the pack has none of its", "is under 20 dB"];
-    settings.quality.is_size() && is_little.iter().any(|little| why.contains(little))
+    settings.quality().is_size() && is_little.iter().any(|little| why.contains(little))
         || blocks && is_level_set && why.contains("flipped")
 }
 
@@ -249,8 +249,8 @@ fn what_meets_its_target_verifies() {
                         "seed {seed}: {:?} of {} frames, {} {}, {:?} range, {:?} masks: {why}",
                         sequence.field,
                         sequence.frames,
-                        settings.format.name(),
-                        settings.quality,
+                        settings.format().name(),
+                        settings.quality(),
                         settings.range,
                         settings.masks,
                     )

@@ -85,7 +85,8 @@ fn cases() -> Vec<(&'static str, Vec<std::path::PathBuf>, &'static str)> {
 fn hdda_and_dda_see_the_same() {
     let folder = tempfile::tempdir().unwrap();
     for (name, frames, grid) in cases() {
-        let settings = Settings { grids: vec![grid.to_owned()], format: Format::F32, ..Settings::default() };
+        let settings =
+            Settings { grids: vec![grid.to_owned()], encoding: Format::F32.into(), ..Settings::default() };
         let (pack, _) = build_verified(&frames, settings, folder.path());
         let field = DecodedFrame::from_pack(&pack.frame(0, 0).unwrap()).unwrap();
         // A box of thousands of voxels takes a DDA too long.
@@ -115,7 +116,8 @@ fn the_shader_sees_what_the_cpu_sees() {
     let folder = tempfile::tempdir().unwrap();
     for (name, frames, grid) in cases() {
         for format in Format::ALL {
-            let settings = Settings { grids: vec![grid.to_owned()], format, ..Settings::default() };
+            let settings =
+                Settings { grids: vec![grid.to_owned()], encoding: format.into(), ..Settings::default() };
             let output = folder.path().join("test.volpack");
             let job = volpack::pipeline::Job::new(
                 frames.clone(),
@@ -165,7 +167,8 @@ fn pictures_look_as_they_did() {
     let folder = tempfile::tempdir().unwrap();
     // The voxels of "negative" are too far apart to be seen in one picture.
     for (name, frames, grid) in cases().into_iter().filter(|(name, ..)| *name != "negative") {
-        let settings = Settings { grids: vec![grid.to_owned()], format: Format::F16, ..Settings::default() };
+        let settings =
+            Settings { grids: vec![grid.to_owned()], encoding: Format::F16.into(), ..Settings::default() };
         let (pack, _) = build_verified(&frames, settings, folder.path());
         let frame = pack.grids[0].frames.len() - 1;
         let renderer = Renderer::new(&pack, Device::Auto).unwrap();
@@ -193,7 +196,7 @@ fn pictures_look_as_they_did() {
 fn the_gpu_decodes_any_bc7_block_as_the_cpu_does() {
     let Some(gpu) = gpu() else { return };
     let folder = tempfile::tempdir().unwrap();
-    let settings = Settings { format: Format::Bc7, zstd: 0, ..Settings::default() };
+    let settings = Settings { encoding: Format::Bc7.into(), zstd: 0, ..Settings::default() };
     build_verified(&[fixture("fog_half_zip.vdb")], settings, folder.path());
     let mut bytes = std::fs::read(folder.path().join("test.volpack")).unwrap();
     let sections = bytes[64..].chunks_exact(80).map(bytemuck::pod_read_unaligned::<Section>);
@@ -234,7 +237,7 @@ fn a_large_node_s_neighbours_are_seen_brick_by_brick() {
     let job = volpack::pipeline::Job::new(
         vec![fixture("levelset_half.vdb")],
         folder.path().join("test.volpack"),
-        Settings { grids: vec!["surface".to_owned()], format: Format::F32, ..Settings::default() },
+        Settings { grids: vec!["surface".to_owned()], encoding: Format::F32.into(), ..Settings::default() },
         volpack::pipeline::VerifyLevel::None,
     );
     // Positive up to x = 127; behind it regions of 8³ whose signs are those of a chessboard.

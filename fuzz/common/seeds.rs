@@ -98,7 +98,7 @@ pub fn build_packs(fixtures: &Path, out: &Path) -> Result<()> {
                 let job = Job::new(
                     files.iter().map(|file| fixtures.join(format!("{file}.vdb"))).collect(),
                     out.join(format!("{name}_{}_{zstd}.volpack", format.name())),
-                    Settings { grids: grids.clone(), format, zstd, ..Settings::default() },
+                    Settings { grids: grids.clone(), encoding: format.into(), zstd, ..Settings::default() },
                     VerifyLevel::None,
                 );
                 build(&job, &mut Silent)?;

@@ -7,12 +7,12 @@ use std::sync::Arc;
 use clap::Args;
 
 use super::cache::{CacheChoice, RemoteArgs};
-use super::{MemoryArg, SettingsArgs, VerifyArg};
+use super::{MemoryArg, VerifyArg};
 use crate::cache::Cache;
 use crate::error::{Error, Result};
 use crate::manifest::{Asset, DEFAULT_NAME, Manifest, expand};
 use crate::pipeline::{Job, Resources, VerifyLevel};
-use crate::settings::Budget;
+use crate::settings::{Budget, SettingsArgs};
 use crate::volume::ScratchFolder;
 
 #[derive(Args)]
@@ -98,7 +98,7 @@ impl JobArgs {
                 .as_deref()
                 .ok_or_else(|| Error::Usage("no output given: add -o OUT.volpack".to_owned()))?;
             let name = stem(output);
-            let settings = self.settings.settings()?;
+            let settings = self.settings.settings().map_err(Error::Usage)?;
             return Ok(vec![(name, expand(&self.frames).map(|f| job(f, output, settings, None)))]);
         }
         if self.output.is_some() || self.settings.any() {

@@ -23,10 +23,7 @@ use clap::{Args, Parser, Subcommand};
 use crate::error::{Error, Result};
 use crate::pipeline::VerifyLevel;
 use crate::render::Device;
-use crate::settings::{
-    ByteSize, ClusterArgs, DEFAULT_ZSTD, Format, Integers, Masks, NonFinite, QualityArgs, RangeMode,
-    Settings, above_zero,
-};
+use crate::settings::{ByteSize, above_zero};
 use crate::verify::PictureSettings;
 
 const EXIT_CODES: &str = "\
@@ -91,39 +88,6 @@ enum Command {
     Sweep(sweep::SweepArgs),
 }
 
-/// How a pack is made, for builds without a manifest.
-#[derive(Args)]
-struct SettingsArgs {
-    /// Grid to pack; repeat for several [default: density, else the only scalar grid]
-    #[arg(short, long = "grid", value_name = "NAME", help_heading = "Input")]
-    grids: Vec<String>,
-    /// Codec of the bricks [default: adaptive]
-    #[arg(short, long, help_heading = "Quality")]
-    format: Option<Format>,
-    #[command(flatten)]
-    quality: QualityArgs,
-    #[command(flatten)]
-    clusters: ClusterArgs,
-    /// Value range that unorm8, bc4 and bc7 texels are normalised to [default: brick]
-    #[arg(short, long, help_heading = "Quality")]
-    range: Option<RangeMode>,
-    /// Which bricks keep their active masks [default: auto]
-    #[arg(long, help_heading = "Quality")]
-    masks: Option<Masks>,
-    /// Treatment of infinities and NaNs [default: refuse]
-    #[arg(long, help_heading = "Input")]
-    nonfinite: Option<NonFinite>,
-    /// Treatment of integer grids [default: keep]
-    #[arg(long, help_heading = "Input")]
-    integers: Option<Integers>,
-    /// zstd level of the file, 1 to 22; 0 for no compression [default: 3]
-    #[arg(long, value_name = "LEVEL", value_parser = clap::value_parser!(i32).range(0..=22), help_heading = "Output")]
-    zstd: Option<i32>,
-    /// Frame rate recorded in the pack, in frames per second
-    #[arg(long, value_name = "RATE", value_parser = positive, help_heading = "Output")]
-    fps: Option<f32>,
-}
-
 /// How much memory work may take.
 #[derive(Args)]
 struct MemoryArg {
@@ -135,46 +99,6 @@ struct MemoryArg {
 impl MemoryArg {
     fn bytes(&self) -> Option<u64> {
         self.memory.map(|size| size.0)
-    }
-}
-
-fn positive(text: &str) -> std::result::Result<f32, String> {
-    match text.parse() {
-        Ok(v) if v > 0.0 && f32::is_finite(v) => Ok(v),
-        _ => Err("a number above 0".to_owned()),
-    }
-}
-
-impl SettingsArgs {
-    fn settings(&self) -> Result<Settings> {
-        let format = self.format.unwrap_or_default();
-        Ok(Settings {
-            grids: self.grids.clone(),
-            format,
-            quality: self.quality.quality(format).map_err(Error::Usage)?,
-            min_frame_psnr: self.quality.min_frame_psnr,
-            clustering: self.clusters.clustering(format).map_err(Error::Usage)?,
-            range: self.range.unwrap_or_default(),
-            masks: self.masks.unwrap_or_default(),
-            nonfinite: self.nonfinite.unwrap_or_default(),
-            integers: self.integers.unwrap_or_default(),
-            zstd: self.zstd.unwrap_or(DEFAULT_ZSTD),
-            fps: self.fps,
-        })
-    }
-
-    /// Whether any is given.
-    fn any(&self) -> bool {
-        !self.grids.is_empty()
-            || self.format.is_some()
-            || self.quality != QualityArgs::default()
-            || self.clusters != ClusterArgs::default()
-            || self.range.is_some()
-            || self.masks.is_some()
-            || self.nonfinite.is_some()
-            || self.integers.is_some()
-            || self.zstd.is_some()
-            || self.fps.is_some()
     }
 }
 

@@ -147,14 +147,14 @@ fn unknown_setting(error: &serde_json::Error) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::settings::{DEFAULT_ZSTD, Quality};
+    use crate::settings::{DEFAULT_ZSTD, Encoding, Quality, UniformCodec};
 
     fn provenance() -> Provenance {
         Provenance {
             tool: "volpack".to_owned(),
             version: "0.3.0".to_owned(),
             encoder_isa: None,
-            settings: Settings { zstd: 0, quality: Quality::Psnr(45.0), ..Settings::default() },
+            settings: Settings { zstd: 0, encoding: Quality::Psnr(45.0).into(), ..Settings::default() },
             sources: Vec::new(),
         }
     }
@@ -172,8 +172,16 @@ mod tests {
         let without_zstd =
             Provenance { settings: Settings { zstd: DEFAULT_ZSTD, ..provenance().settings }, ..provenance() };
         assert_eq!(read("\"zstd\": 0,", "").unwrap(), without_zstd);
-        let settings = Settings { clustering: Some(Default::default()), ..provenance().settings };
-        assert_eq!(read("\"clustering\": null", "\"clustering\": {}").unwrap().settings, settings);
+        let clustered = Encoding::Uniform { codec: UniformCodec::Bc7, clustering: Some(Default::default()) };
+        let provenance_of_bc7 = Provenance {
+            settings: Settings { encoding: clustered, ..provenance().settings },
+            ..provenance()
+        };
+        let json = String::from_utf8(provenance_of_bc7.to_json().unwrap()).unwrap();
+        let (start, end) =
+            (json.find("{\n      \"clusters\"").unwrap(), json.find(",\n    \"range\"").unwrap());
+        let short = [&json[..start], "{}", &json[end..]].concat();
+        assert_eq!(Provenance::from_json(short.as_bytes()).unwrap(), provenance_of_bc7);
         assert_eq!(read("\"tool\"", "\"comment\": [1, {}], \"tool\"").unwrap(), provenance());
     }
 
@@ -185,6 +193,11 @@ mod tests {
             ("\"adaptive\"", "\"bc6h\"", "the value `bc6h` of a setting"),
             ("{\n      \"psnr\"", "{\"ssim\"", "the value `ssim` of a setting"),
             ("\"zstd\": 0", "\"zstd\": \"fast\"", "a setting in another form (invalid type"),
+            (
+                "\"clustering\": null",
+                "\"clustering\": {}",
+                "a setting in another form (clustering with the adaptive format",
+            ),
         ] {
             let error = read(from, to).unwrap_err();
             let says = error.to_string();

@@ -4,7 +4,7 @@ use super::Progress;
 use super::cached_bricks::CachedOffers;
 use crate::cancel::CancelToken;
 use crate::error::{Error, Result};
-use crate::settings::{Format, Integers, Quality, Settings, whole_range};
+use crate::settings::{Encoding, Integers, Quality, Settings, whole_range};
 use crate::stages::allocate::{self, AdaptiveGrid, Allocation, EarlierOffers, Target};
 use crate::stages::dedup::SequenceTree;
 use crate::stages::encoder_cache::{ConstantAim, EncoderCache, Terms};
@@ -45,12 +45,13 @@ pub(super) fn allocate(
     settings: &Settings,
     progress: &mut dyn Progress,
 ) -> Result<Vec<Allocation>> {
-    let Some(codec) = settings.format.codec() else {
+    let Encoding::Uniform { codec, clustering } = &settings.encoding else {
         return adaptive(facts, trees, encoders, offers, settings, progress);
     };
+    let codec = codec.codec();
     let mut allocations = Vec::new();
     for ((facts, tree), encoders) in facts.iter().zip(trees).zip(encoders) {
-        allocations.push(match &settings.clustering {
+        allocations.push(match clustering {
             None => allocate::uniform(tree, encoders, codec),
             Some(clustering) => {
                 progress.stage("cluster", tree.pool.len().into(), "bricks");
@@ -69,14 +70,14 @@ fn adaptive(
     settings: &Settings,
     progress: &mut dyn Progress,
 ) -> Result<Vec<Allocation>> {
-    let size = match settings.quality {
+    let size = match settings.quality() {
         Quality::Size(bytes) => Some(bytes),
         Quality::BitsPerVoxel(bits) => Some((bits * 64.0 * leaves(trees) as f64) as u64),
         _ => None,
     };
     let target = Target {
         size,
-        min_frame_psnr: settings.min_frame_psnr,
+        min_frame_psnr: settings.min_frame_psnr(),
         fixed_bytes: if size.is_some() { tree_bytes(facts.iter().zip(&*trees))? } else { 0 },
     };
     let bricks: u64 = trees.iter().map(|tree| u64::from(tree.pool.len())).sum();
@@ -106,7 +107,7 @@ fn adaptive(
 const SIGNED_PART_OF_BOUND: f64 = 0.2;
 
 fn terms(facts: &GridFacts, tree: &SequenceTree, settings: &Settings) -> Terms {
-    let is_adaptive = settings.format == Format::Adaptive;
+    let is_adaptive = settings.is_adaptive();
     let (quality, voxel_size) = (quality(facts, tree, settings), facts.smallest_voxel());
     let sign_matters = verify::SIGN_MATTERS_VOXELS * voxel_size;
     let (aim, sign_matters) = match quality {
@@ -148,7 +149,7 @@ fn peak(tree: &SequenceTree) -> f64 {
 
 /// What is asked of a grid.
 fn quality(facts: &GridFacts, tree: &SequenceTree, settings: &Settings) -> Quality {
-    settings.quality.of_grid(facts.class, peak(tree), facts.smallest_voxel())
+    settings.quality().of_grid(facts.class, peak(tree), facts.smallest_voxel())
 }
 
 /// Leaves of the source over all frames.
@@ -163,13 +164,13 @@ pub(super) fn check_size(
     texel_bytes: u64,
     settings: &Settings,
 ) -> Result<()> {
-    if settings.format != Format::Adaptive || !settings.quality.is_size() {
+    if !settings.is_adaptive() || !settings.quality().is_size() {
         return Ok(());
     }
     let leaves = leaves(trees);
     let bits_of = |bytes: u64| if leaves == 0 { 0.0 } else { bytes as f64 / (64.0 * leaves as f64) };
     let bytes = tree_bytes(facts.iter().zip(trees))? + texel_bytes;
-    match settings.quality {
+    match settings.quality() {
         Quality::Size(asked) if bytes > asked => Err(Error::Usage(format!(
             "size: {asked} bytes on the GPU cannot be reached, the least is {bytes}: raise it, or pack fewer frames"
         ))),

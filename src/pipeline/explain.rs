@@ -99,7 +99,7 @@ fn reasons(job: &Job, new: &Provenance) -> Vec<String> {
     }
     let settings = |provenance: &Provenance| {
         let mut settings = serde_json::to_value(&provenance.settings).unwrap_or_default();
-        settings["quality"] = provenance.settings.quality.to_string().into();
+        settings["quality"] = provenance.settings.quality().to_string().into();
         settings
     };
     let text = |value: &Json| value.as_str().map_or_else(|| value.to_string(), str::to_owned);

@@ -201,7 +201,7 @@ pub(super) fn unknown(
 }
 
 fn mask_policy(settings: &Settings, class: GridClass) -> MaskPolicy {
-    match (settings.masks, settings.format, class) {
+    match (settings.masks, settings.format(), class) {
         (Masks::Keep, ..) | (Masks::Auto, Format::F32, _) | (Masks::Auto, _, GridClass::LevelSet) => {
             MaskPolicy::Keep
         }

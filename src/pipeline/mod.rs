@@ -21,7 +21,7 @@ pub use crate::progress::{Progress, Silent};
 use crate::report::PackSummary;
 pub use crate::report::model::Made;
 use crate::report::model::{BuildReport, StageSeconds};
-use crate::settings::{Format, NOT_WITH_ADAPTIVE, Settings};
+use crate::settings::{Format, Settings};
 use crate::stages::allocate::Allocation;
 use crate::stages::dedup::SequenceTree;
 use crate::stages::encoder_cache::EncoderCache;
@@ -253,9 +253,6 @@ struct Plan {
 /// Stages 1 and 2, and what they found odd.
 fn plan(job: &Job, progress: &mut dyn Progress) -> Result<(Plan, Vec<String>)> {
     check_output(job)?;
-    if job.settings.format == Format::Adaptive && job.settings.clustering.is_some() {
-        return Err(Error::Usage(NOT_WITH_ADAPTIVE.to_owned()));
-    }
     progress.stage("metadata", job.frames.len() as u64, "files");
     let digests = Digests {
         known: job.cache.as_deref().map(|cache| cache as &dyn KnownDigests),
@@ -436,7 +433,7 @@ impl Clock {
 }
 
 fn provenance(sequence: &SequenceInfo, settings: &Settings) -> Provenance {
-    let uses_block_encoder = matches!(settings.format, Format::Bc4 | Format::Bc7 | Format::Adaptive);
+    let uses_block_encoder = matches!(settings.format(), Format::Bc4 | Format::Bc7 | Format::Adaptive);
     Provenance {
         tool: env!("CARGO_PKG_NAME").to_owned(),
         version: env!("CARGO_PKG_VERSION").to_owned(),

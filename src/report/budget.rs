@@ -2,7 +2,7 @@
 
 use super::model::{Breach, BuildReport, Figures, Total};
 use crate::pack::Pack;
-use crate::settings::{Budget, ErrorBound, Format, Masks, Quality, Settings};
+use crate::settings::{Budget, ErrorBound, Masks, Quality, Settings};
 use crate::units::{bytes, seconds};
 use crate::vdb::voxel_size;
 use crate::verify::VerifyReport;
@@ -240,16 +240,16 @@ impl Checked<'_> {
     /// A setting of adaptive packs, and what it does not go with: "use" where it certainly meets the limit, else "try".
     fn adaptive(&self, setting: &str, verb: &str) -> String {
         let settings = self.settings;
-        let asked = key(settings.quality).filter(|asked| !setting.starts_with(asked));
-        let format = if settings.format == Format::Adaptive { "" } else { "format = \"adaptive\"` with `" };
+        let asked = key(settings.quality()).filter(|asked| !setting.starts_with(asked));
+        let format = if settings.is_adaptive() { "" } else { "format = \"adaptive\"` with `" };
         let mut remedy = format!("{verb} `{format}{setting}`");
-        if let Some(asked) = asked.filter(|_| settings.format == Format::Adaptive) {
+        if let Some(asked) = asked.filter(|_| settings.is_adaptive()) {
             remedy += &format!(" instead of `{asked}`");
         }
-        if settings.clustering.is_some() {
+        if settings.clustering().is_some() {
             remedy += ", without `dedup`";
         }
-        if settings.min_frame_psnr.is_some() && !setting.starts_with("psnr") {
+        if settings.min_frame_psnr().is_some() && !setting.starts_with("psnr") {
             remedy += ", without `min_frame_psnr`";
         }
         remedy

@@ -81,7 +81,7 @@ impl Reported<'_> {
         }
         .breaches();
         let mut settings = serde_json::to_value(&provenance.settings).unwrap_or_default();
-        settings["quality"] = provenance.settings.quality.to_string().into();
+        settings["quality"] = provenance.settings.quality().to_string().into();
         let report = PackReport {
             file: self.file.display().to_string(),
             change: baseline.map(|old| figures.change_from(old)),

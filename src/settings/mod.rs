@@ -1,58 +1,24 @@
 //! What a build can be asked for: the words of the manifest, the command line and a pack's provenance.
 
+mod args;
 mod budget;
 mod clustering;
+mod document;
+mod encoding;
 mod quality;
 
 use clap::ValueEnum;
 use serde::{Deserialize, Serialize};
 
+pub use args::SettingsArgs;
 pub use budget::{Budget, Share};
-pub use clustering::{ClusterArgs, Clustering, Dedup, NOT_WITH_ADAPTIVE};
-pub use quality::{ByteSize, ErrorBound, FRAME_MARGIN_DB, Quality, QualityArgs, above_zero, whole_range};
+pub use clustering::{Clustering, Dedup};
+pub use encoding::{Encoding, Format, UniformCodec};
+pub(crate) use quality::check_above_zero;
+pub use quality::{ByteSize, ErrorBound, FRAME_MARGIN_DB, Quality, above_zero, whole_range};
 
 use crate::codec::Codec;
-
-/// How the bricks of an asset are stored.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
-#[serde(rename_all = "lowercase")]
-pub enum Format {
-    /// The cheapest codec for each brick at the quality asked
-    #[default]
-    Adaptive,
-    /// 32-bit floats, lossless
-    F32,
-    /// 16-bit floats, exact where the source is half
-    F16,
-    /// 8 bits per voxel
-    Unorm8,
-    /// BC4 blocks, 4 bits per voxel
-    Bc4,
-    /// BC7 blocks, 2 bits per voxel
-    Bc7,
-}
-
-impl Format {
-    /// The codec of every brick that is not constant, where there is one for all.
-    pub fn codec(self) -> Option<Codec> {
-        match self {
-            Self::Adaptive => None,
-            Self::F32 => Some(Codec::F32),
-            Self::F16 => Some(Codec::F16),
-            Self::Unorm8 => Some(Codec::Unorm8),
-            Self::Bc4 => Some(Codec::Bc4),
-            Self::Bc7 => Some(Codec::Bc7),
-        }
-    }
-
-    /// Its name in manifests and reports.
-    pub fn name(self) -> &'static str {
-        self.codec().map_or("adaptive", Codec::name)
-    }
-
-    /// Every format: those of one codec, finest first, then the adaptive one.
-    pub const ALL: [Self; 6] = [Self::F32, Self::F16, Self::Unorm8, Self::Bc4, Self::Bc7, Self::Adaptive];
-}
+use document::Document;
 
 /// What the 0 and 1 of normalised texels stand for.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
@@ -103,30 +69,17 @@ pub enum Integers {
     Nearest,
 }
 
-impl Integers {
-    /// What packs were made with before there was a choice.
-    fn before_there_was_a_choice() -> Self {
-        Self::Nearest
-    }
-}
-
 /// The zstd level of a pack where none is chosen: the level of zstd's own tool.
 pub const DEFAULT_ZSTD: i32 = 3;
 
-/// Everything that a pack's bytes depend on beside its sources.
+/// Everything that a pack's bytes depend on beside its sources. Its JSON is a flat object: [`Document`].
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
+#[serde(into = "Document", try_from = "Document")]
 pub struct Settings {
     /// The grids to pack; none for the default one.
     pub grids: Vec<String>,
     /// How bricks are stored.
-    pub format: Format,
-    /// What an adaptive pack meets.
-    pub quality: Quality,
-    /// The PSNR that no frame of an adaptive pack falls below, in dB; none for 6 dB below the whole.
-    pub min_frame_psnr: Option<f64>,
-    /// How similar bricks are clustered; none for not at all.
-    pub clustering: Option<Clustering>,
+    pub encoding: Encoding,
     /// What normalised texels are fractions of.
     pub range: RangeMode,
     /// Whether bricks keep their masks.
@@ -134,7 +87,6 @@ pub struct Settings {
     /// What to do with infinities and NaNs.
     pub nonfinite: NonFinite,
     /// What becomes of grids of integers.
-    #[serde(default = "Integers::before_there_was_a_choice")]
     pub integers: Integers,
     /// zstd's level, 1 to 22; 0 stores everything raw.
     pub zstd: i32,
@@ -146,16 +98,58 @@ impl Default for Settings {
     fn default() -> Self {
         Self {
             grids: Vec::new(),
-            format: Format::default(),
-            quality: Quality::default(),
-            min_frame_psnr: None,
-            clustering: None,
+            encoding: Encoding::default(),
             range: RangeMode::default(),
             masks: Masks::default(),
             nonfinite: NonFinite::default(),
             integers: Integers::default(),
             zstd: DEFAULT_ZSTD,
             fps: None,
+        }
+    }
+}
+
+impl Settings {
+    /// The kind of encoding.
+    pub fn format(&self) -> Format {
+        match self.encoding {
+            Encoding::Adaptive { .. } => Format::Adaptive,
+            Encoding::Uniform { codec, .. } => codec.format(),
+        }
+    }
+
+    /// Whether each brick has a codec of its own.
+    pub fn is_adaptive(&self) -> bool {
+        matches!(self.encoding, Encoding::Adaptive { .. })
+    }
+
+    /// The codec of every brick that is not constant, where there is one for all.
+    pub fn codec(&self) -> Option<Codec> {
+        self.format().codec()
+    }
+
+    /// What an adaptive pack meets. With one codec for all bricks nothing is asked, and it is the default: by that the
+    /// values of constant bricks are chosen.
+    pub fn quality(&self) -> Quality {
+        match self.encoding {
+            Encoding::Adaptive { quality, .. } => quality,
+            Encoding::Uniform { .. } => Quality::default(),
+        }
+    }
+
+    /// The PSNR that no frame of an adaptive pack falls below, in dB; none for 6 dB below the whole.
+    pub fn min_frame_psnr(&self) -> Option<f64> {
+        match self.encoding {
+            Encoding::Adaptive { min_frame_psnr, .. } => min_frame_psnr,
+            Encoding::Uniform { .. } => None,
+        }
+    }
+
+    /// How similar bricks are clustered; none for not at all.
+    pub fn clustering(&self) -> Option<&Clustering> {
+        match &self.encoding {
+            Encoding::Adaptive { .. } => None,
+            Encoding::Uniform { clustering, .. } => clustering.as_ref(),
         }
     }
 }

@@ -3,10 +3,8 @@
 use std::fmt;
 use std::str::FromStr;
 
-use clap::Args;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-use super::Format;
 use crate::vdb::GridClass;
 
 /// The PSNR of fog for which nothing is asked: smoke shows no blocks in its haze there, as it does at 45 dB
@@ -187,34 +185,14 @@ impl FromStr for ByteSize {
     }
 }
 
-/// The settings of which an adaptive pack has one, and its floor for single frames.
-#[derive(Args, Clone, Debug, Default, PartialEq)]
-pub struct QualityArgs {
-    /// Minimum PSNR over active voxels, in dB [default: 55; level sets have --max-error "0.05 voxels"]
-    #[arg(long, value_name = "DB", value_parser = decibels, group = "quality", help_heading = "Quality")]
-    pub psnr: Option<f64>,
-    /// Maximum error of any voxel: 0.01 or 1% of the value range, "0.2 units" or "0.1 voxels"
-    #[arg(long, value_name = "ERROR", group = "quality", help_heading = "Quality")]
-    pub max_error: Option<ErrorBound>,
-    /// Maximum GPU bits per voxel, counted over all 512 voxels of each leaf
-    #[arg(long, value_name = "BITS", value_parser = above_zero, group = "quality", help_heading = "Quality")]
-    pub bits_per_voxel: Option<f64>,
-    /// Maximum size on the GPU (tree, masks and texels): 40MB, 512KiB
-    #[arg(long, value_name = "BYTES", group = "quality", help_heading = "Quality")]
-    pub size: Option<ByteSize>,
-    /// Minimum PSNR of any single frame, in dB [default: 6 dB below the sequence's]
-    #[arg(long, value_name = "DB", value_parser = decibels, help_heading = "Quality")]
-    pub min_frame_psnr: Option<f64>,
-}
-
 /// PSNR past this is below the rounding of an f32.
 const MAX_DB: f64 = 200.0;
 
-fn decibels(text: &str) -> Result<f64, String> {
+pub(super) fn decibels(text: &str) -> Result<f64, String> {
     check_decibels(text.parse().unwrap_or(f64::NAN))
 }
 
-fn check_decibels(db: f64) -> Result<f64, String> {
+pub(super) fn check_decibels(db: f64) -> Result<f64, String> {
     if (0.0..=MAX_DB).contains(&db) { Ok(db) } else { Err(format!("a number of dB from 0 to {MAX_DB}")) }
 }
 
@@ -226,46 +204,8 @@ pub fn above_zero(text: &str) -> Result<f64, String> {
     check_above_zero(text.parse().unwrap_or(f64::NAN))
 }
 
-pub(super) fn check_above_zero(v: f64) -> Result<f64, String> {
+pub(crate) fn check_above_zero(v: f64) -> Result<f64, String> {
     if v > 0.0 && v.is_finite() { Ok(v) } else { Err("a number above 0".to_owned()) }
-}
-
-impl QualityArgs {
-    /// What is asked for.
-    ///
-    /// # Errors
-    /// When more than one thing is, a number makes no sense, or the format has no choice.
-    pub fn quality(&self, format: Format) -> Result<Quality, String> {
-        if *self != Self::default() && format != Format::Adaptive {
-            return Err(format!(
-                "psnr, max_error, bits_per_voxel, size and min_frame_psnr are for the adaptive format, not for {}",
-                format.name()
-            ));
-        }
-        for (key, db) in [("psnr", self.psnr), ("min_frame_psnr", self.min_frame_psnr)] {
-            db.map_or(Ok(0.0), check_decibels).map_err(|e| format!("{key}: {e}"))?;
-        }
-        let bits = self.bits_per_voxel.map_or(Ok(0.0), check_above_zero);
-        bits.map_err(|e| format!("bits_per_voxel: {e}"))?;
-        if let Some(bound) = self.max_error.filter(|bound| bound.fraction().is_some_and(|part| part >= 1.0)) {
-            return Err(whole_range(bound, 1.0, 1.0));
-        }
-        if self.max_error.is_some() && self.min_frame_psnr.is_some() {
-            return Err("max_error holds for every voxel of every frame: min_frame_psnr does not go with it"
-                .to_owned());
-        }
-        let asked = [
-            self.psnr.map(Quality::Psnr),
-            self.max_error.map(Quality::MaxError),
-            self.bits_per_voxel.map(Quality::BitsPerVoxel),
-            self.size.map(|size| Quality::Size(size.0)),
-        ];
-        let mut asked = asked.into_iter().flatten();
-        match (asked.next(), asked.next()) {
-            (_, Some(_)) => Err("give one of psnr, max_error, bits_per_voxel and size".to_owned()),
-            (quality, None) => Ok(quality.unwrap_or_default()),
-        }
-    }
 }
 
 /// Why an error bound that is the whole range of values or more is refused, for a grid whose values span `peak` and whose

@@ -4,7 +4,7 @@ use crate::error::{Error, Result};
 use crate::pack::{Grid, Pack};
 use crate::pipeline::{Job, Progress, VerifyLevel, build};
 use crate::report::model::{Cheaper, Figures};
-use crate::settings::{ErrorBound, Format, Quality, Settings};
+use crate::settings::{Encoding, ErrorBound, Quality, Settings};
 
 /// A step down: half a bit a voxel on fog, too little to see from one to the next.
 const STEP_DB: f64 = 3.0;
@@ -43,29 +43,36 @@ pub fn cheaper(
 
 /// The next setting down, as a manifest has it.
 fn next(settings: &Settings, figures: &Figures, only_level_sets: bool) -> Option<(String, Settings)> {
-    let (text, quality) = match (settings.format, settings.quality) {
-        // What suits fog does not suit level sets: a pack that has both goes by what its fog is asked for.
-        (Format::Adaptive, Quality::ByClass { level_set_error, .. }) if only_level_sets => {
-            max_error(level_set_error)
-        }
-        (Format::Adaptive, Quality::Psnr(db) | Quality::ByClass { psnr: db, .. }) => psnr(db - STEP_DB)?,
-        (Format::Adaptive, Quality::MaxError(bound)) => max_error(bound),
-        (Format::Adaptive, Quality::BitsPerVoxel(bits)) => {
-            let bits = bits * STEP_SIZE;
-            (format!("bits_per_voxel = {bits}"), Quality::BitsPerVoxel(bits))
-        }
-        (Format::Adaptive, Quality::Size(bytes)) => {
-            let bytes = (bytes as f64 * STEP_SIZE) as u64;
-            (format!("size = {bytes}"), Quality::Size(bytes))
+    // A floor for frames stays: what is below it is not what was asked for.
+    let (before, (text, quality), after, min_frame_psnr) = match settings.encoding {
+        Encoding::Adaptive { quality, min_frame_psnr } => {
+            ("", coarser(quality, only_level_sets)?, "", min_frame_psnr)
         }
         // One codec for all costs more than the same quality from several.
-        _ => psnr(figures.psnr.map_or(FINEST_DB, |db| db.min(FINEST_DB).floor()))?,
+        Encoding::Uniform { clustering, .. } => {
+            let quality = psnr(figures.psnr.map_or(FINEST_DB, |db| db.min(FINEST_DB).floor()))?;
+            ("format = \"adaptive\", ", quality, if clustering.is_some() { ", no dedup" } else { "" }, None)
+        }
     };
-    let format = if settings.format == Format::Adaptive { "" } else { "format = \"adaptive\", " };
-    // A floor for frames stays: what is below it is not what was asked for.
-    let dedup = if settings.clustering.is_some() { ", no dedup" } else { "" };
-    let settings = Settings { format: Format::Adaptive, quality, clustering: None, ..settings.clone() };
-    Some((format!("{format}{text}{dedup}"), settings))
+    let encoding = Encoding::Adaptive { quality, min_frame_psnr };
+    Some((format!("{before}{text}{after}"), Settings { encoding, ..settings.clone() }))
+}
+
+fn coarser(quality: Quality, only_level_sets: bool) -> Option<(String, Quality)> {
+    match quality {
+        // What suits fog does not suit level sets: a pack that has both goes by what its fog is asked for.
+        Quality::ByClass { level_set_error, .. } if only_level_sets => Some(max_error(level_set_error)),
+        Quality::Psnr(db) | Quality::ByClass { psnr: db, .. } => psnr(db - STEP_DB),
+        Quality::MaxError(bound) => Some(max_error(bound)),
+        Quality::BitsPerVoxel(bits) => {
+            let bits = bits * STEP_SIZE;
+            Some((format!("bits_per_voxel = {bits}"), Quality::BitsPerVoxel(bits)))
+        }
+        Quality::Size(bytes) => {
+            let bytes = (bytes as f64 * STEP_SIZE) as u64;
+            Some((format!("size = {bytes}"), Quality::Size(bytes)))
+        }
+    }
 }
 
 fn max_error(bound: ErrorBound) -> (String, Quality) {

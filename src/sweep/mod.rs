@@ -15,7 +15,9 @@ use serde::Serialize;
 use crate::error::{Error, Result};
 use crate::pipeline::{Job, Progress, VerifyLevel};
 use crate::report::chart::{self, Point, Spread};
-use crate::settings::{Clustering, ErrorBound, Format, Integers, NonFinite, Quality, RangeMode, Settings};
+use crate::settings::{
+    Clustering, Encoding, ErrorBound, Format, Integers, NonFinite, Quality, RangeMode, Settings, UniformCodec,
+};
 
 pub use cheaper::cheaper;
 pub use field::{Difference, Jumps};
@@ -94,10 +96,10 @@ const CLUSTERINGS: [(u32, u32, f64); 7] = [
 ];
 
 impl Options {
-    fn settings(&self, format: Format) -> Settings {
+    fn settings(&self, encoding: impl Into<Encoding>) -> Settings {
         Settings {
             grids: self.grid.iter().cloned().collect(),
-            format,
+            encoding: encoding.into(),
             nonfinite: self.nonfinite,
             // Codecs are compared, those too that do not keep integers.
             integers: Integers::Nearest,
@@ -119,7 +121,7 @@ impl Options {
 
     /// Adaptive packs of a quality.
     pub fn adaptive(&self, quality: Quality) -> Method {
-        let settings = Settings { quality, ..self.settings(Format::Adaptive) };
+        let settings = self.settings(quality);
         let (method, setting) = match quality {
             Quality::Psnr(db) => ("adaptive", format!("psnr = {db}")),
             Quality::ByClass { .. } => ("default", "adaptive".to_owned()),
@@ -130,7 +132,7 @@ impl Options {
 
     fn clustered(&self, (clusters, iterations, variance): (u32, u32, f64), seed: u64) -> Method {
         let clustering = Some(Clustering { clusters, iterations, variance, seed });
-        let settings = Settings { clustering, ..self.settings(Format::Bc7) };
+        let settings = self.settings(Encoding::Uniform { codec: UniformCodec::Bc7, clustering });
         Method {
             method: "kmeans",
             // The thesis's three columns.

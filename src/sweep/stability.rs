@@ -11,7 +11,7 @@ use crate::pack::Pack;
 use crate::pipeline::{Progress, Silent, build_altered};
 use crate::report::PackSummary;
 use crate::report::chart::Spread;
-use crate::settings::{Clustering, Format, Integers, Quality, Settings};
+use crate::settings::{Encoding, Integers, Quality};
 use crate::stages::flatten::Flattened;
 use crate::stages::metadata;
 use crate::stages::select::select;
@@ -55,7 +55,7 @@ fn variations(options: &Options, method: &Method) -> Vec<Variation> {
     for noise in [Noise::Ulp, Noise::Fraction(1e-3)] {
         out.extend([1, 2].map(|seed| Variation::Noise(noise, seed)));
     }
-    if method.settings.clustering.is_some() {
+    if method.settings.clustering().is_some() {
         out.extend([1, 2, 3].map(Variation::Seed));
     }
     out
@@ -97,7 +97,7 @@ fn spread(options: &Options, method: &Method, folder: &Path) -> Result<Spread> {
         failures.push(format!("PSNR differs by {:.1} dB from run to run", psnr.1 - psnr.0));
     }
     let max_error = range(&|run| run.max_error);
-    if let (Quality::MaxError(bound), Format::Adaptive) = (method.settings.quality, method.settings.format)
+    if let Encoding::Adaptive { quality: Quality::MaxError(bound), .. } = method.settings.encoding
         && bound.fraction().is_some_and(|bound| max_error.1 > bound)
     {
         failures.push("its error is past the bound".to_owned());
@@ -125,8 +125,9 @@ fn run(options: &Options, method: &Method, variation: Variation, folder: &Path) 
         Variation::Order(order) => frames = renumbered(&options.frames, order, folder)?,
         Variation::Noise(of, seed) => noise = Some((of, seed)),
         Variation::Seed(seed) => {
-            let clustering = method.settings.clustering.map(|c| Clustering { seed, ..c });
-            method.settings = Settings { clustering, ..method.settings };
+            if let Encoding::Uniform { clustering: Some(clustering), .. } = &mut method.settings.encoding {
+                clustering.seed = seed;
+            }
         }
     }
     let alter = |frame: &mut crate::volume::FlatFrame| {

@@ -6,7 +6,7 @@ use super::Reading;
 use super::promise::Promise;
 use crate::codec::{BrickRange, Codec};
 use crate::pack::{FrameReader, Region};
-use crate::settings::{Format, Masks};
+use crate::settings::Masks;
 use crate::vdb::{Accessor, GridInfo, Internal, Scalar, Tree};
 use crate::volume::{
     BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, InactiveRule, Mask512, ROOT_DIM, ValueRange,
@@ -248,7 +248,7 @@ impl<T: Scalar> Comparison<'_, T> {
             Masks::Drop => true,
             Masks::Auto => self.promise.sign_matters.is_none() && self.reader.grid().background == 0.0,
         };
-        let may_be_empty = settings.format == Format::Adaptive && drops_masks;
+        let may_be_empty = settings.is_adaptive() && drops_masks;
         let record = match region {
             Region::Brick(record) => record,
             Region::Background if may_be_empty => {
@@ -275,11 +275,11 @@ impl<T: Scalar> Comparison<'_, T> {
         // Room for the arithmetic of decoding, which is in f32.
         let slack = 1e-6 * (span + f64::from(sequence.lo).abs());
         let values = match record.codec {
-            _ if settings.clustering.is_some() => Bound::Nothing,
+            _ if settings.clustering().is_some() => Bound::Nothing,
             // A brick may read texels that were made for another, and a record does not say whether it does: their ranges
             // may well be equal. What was asked, and the frame's L2 error, hold all the same.
-            codec if settings.format == Format::Adaptive && codec.is_normalised() => Bound::Nothing,
-            Codec::Constant if settings.format == Format::Adaptive => {
+            codec if settings.is_adaptive() && codec.is_normalised() => Bound::Nothing,
+            Codec::Constant if settings.is_adaptive() => {
                 // The value lies between the least and the greatest that it stands for.
                 let (source, mask) = (self.tree.leaves.values(leaf), &self.tree.leaves.masks[leaf]);
                 let texel_mask = (0..BRICK_VOXELS).filter(|&i| mask.get(i) || !exact_inactive);

@@ -8,7 +8,7 @@ use super::compare::{ERROR_BINS, Error, FrameError, Histogram};
 use super::promise::Promise;
 use crate::codec::Codec;
 use crate::pack::{Grid, Pack};
-use crate::settings::{FRAME_MARGIN_DB, Format, Quality, Settings};
+use crate::settings::{FRAME_MARGIN_DB, Quality, Settings};
 use crate::units::count;
 use crate::volume::ValueRange;
 
@@ -120,7 +120,7 @@ const RUINED_DB: f64 = 20.0;
 fn broken_psnr(promise: &Promise, grid: &GridReport, frames: &[FrameReport]) -> Vec<String> {
     let settings = promise.settings;
     let mut broken = Vec::new();
-    let mut floor = settings.min_frame_psnr;
+    let mut floor = settings.min_frame_psnr();
     let below = |metrics: &Metrics, asked: f64| metrics.psnr.filter(|db| *db < asked - PSNR_TOLERANCE_DB);
     match promise.quality {
         Quality::Psnr(asked) => {
@@ -148,7 +148,7 @@ fn broken_size(pack: &Pack, settings: &Settings) -> Option<String> {
     let bytes = pack.gpu_bytes();
     let leaves =
         pack.grids.iter().flat_map(|g| &g.frames).map(|f| f.record.leaves).fold(0, u64::saturating_add);
-    match settings.quality {
+    match settings.quality() {
         Quality::Size(asked) if bytes > asked => {
             Some(format!("{bytes} bytes on the GPU exceed the {asked} that were asked"))
         }
@@ -169,8 +169,8 @@ fn ruined(promise: &Promise, grid: &GridReport, errors: &[FrameError]) -> Option
             count(voxels)
         ));
     }
-    let is_asked = promise.settings.format == Format::Adaptive
-        && matches!(promise.quality, Quality::Psnr(_) | Quality::MaxError(_));
+    let is_asked =
+        promise.settings.is_adaptive() && matches!(promise.quality, Quality::Psnr(_) | Quality::MaxError(_));
     let psnr = grid.active.psnr.filter(|db| *db < RUINED_DB && !is_asked)?;
     Some(format!(
         "grid {:?}: {psnr:.1} dB is under {RUINED_DB} dB, at which nothing of it can be recognised: ask for a finer quality, \
@@ -248,13 +248,13 @@ impl VerifyReport {
                 histogram,
             };
             failures.extend(broken_table(grid, &errors));
-            if settings.format == Format::Adaptive {
+            if settings.is_adaptive() {
                 failures.extend(broken_psnr(&promise, &report, &frames[first_frame..]));
             }
             failures.extend(ruined(&promise, &report, &errors));
             grids.push(report);
         }
-        if settings.format == Format::Adaptive {
+        if settings.is_adaptive() {
             failures.extend(broken_size(pack, settings));
         }
         let worst_frame = frames

@@ -1,7 +1,7 @@
 //! What a grid of a pack was asked for, as far as its voxels can keep it or not.
 
 use crate::pack::Grid;
-use crate::settings::{Format, Integers, Quality, Settings};
+use crate::settings::{Integers, Quality, Settings};
 use crate::vdb::GridClass;
 
 /// A level set's sign may flip where the surface is nearer than this many voxels: there the sign is
@@ -33,15 +33,13 @@ impl<'a> Promise<'a> {
         let (peak, voxel_size) = (grid.peak(), grid.voxel_size());
         let is_level_set = grid.is_level_set();
         let class = if is_level_set { GridClass::LevelSet } else { GridClass::Unknown };
-        let quality = settings.quality.of_grid(class, peak, voxel_size);
+        let quality = settings.quality().of_grid(class, peak, voxel_size);
         Self {
             settings,
             quality,
             peak,
             max_error: match quality {
-                Quality::MaxError(bound) if settings.format == Format::Adaptive => {
-                    Some(bound.absolute(peak, voxel_size))
-                }
+                Quality::MaxError(bound) if settings.is_adaptive() => Some(bound.absolute(peak, voxel_size)),
                 _ => None,
             },
             error_below: (is_integer && settings.integers != Integers::Nearest).then_some(KEPT_INTEGER_ERROR),

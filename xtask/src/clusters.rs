@@ -7,7 +7,7 @@ use serde_json::json;
 use volpack::codec::Codec;
 use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
-use volpack::settings::{Clustering, Format, Settings};
+use volpack::settings::{Clustering, Encoding, Settings, UniformCodec};
 
 use crate::{peer_programs, sequence};
 
@@ -47,7 +47,10 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             let job = Job::new(
                 frames.clone(),
                 folder.path().join("bench.volpack"),
-                Settings { format: Format::Bc7, clustering, ..Settings::default() },
+                Settings {
+                    encoding: Encoding::Uniform { codec: UniformCodec::Bc7, clustering },
+                    ..Settings::default()
+                },
                 VerifyLevel::Voxels,
             );
             let report =

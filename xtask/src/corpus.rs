@@ -142,7 +142,8 @@ fn grids(sequence: &Sequence) -> Result<Vec<Grid>, VolpackError> {
 
 /// The settings for every grid, with their names.
 fn settings(half_of_default: Option<u64>) -> Vec<(String, Settings)> {
-    let quality = |name: String, quality| (name, Settings { quality, ..Settings::default() });
+    let quality =
+        |name: String, quality: Quality| (name, Settings { encoding: quality.into(), ..Settings::default() });
     let mut all = Vec::new();
     all.extend((35..=65).step_by(5).map(|db| quality(format!("psnr {db}"), Quality::Psnr(db.into()))));
     all.extend(
@@ -152,7 +153,9 @@ fn settings(half_of_default: Option<u64>) -> Vec<(String, Settings)> {
     all.extend(half_of_default.map(|size| quality("half the size".to_owned(), Quality::Size(size))));
     all.push(quality("1 bit per voxel".to_owned(), Quality::BitsPerVoxel(1.0)));
     let uniform = Format::ALL.into_iter().filter(|format| format.codec().is_some());
-    all.extend(uniform.map(|format| (format.name().to_owned(), Settings { format, ..Settings::default() })));
+    all.extend(uniform.map(|format| {
+        (format.name().to_owned(), Settings { encoding: format.into(), ..Settings::default() })
+    }));
     all
 }
 
@@ -217,11 +220,11 @@ fn end(job: &Job, grid: &Grid) -> End {
 
 /// The reason why a refusal is correct: a list of what volpack cannot pack at all, or not with the given setting.
 fn reason(job: &Job, grid: &Grid, why: &str) -> Option<&'static str> {
-    let format = job.settings.format;
+    let format = job.settings.format();
     let is_uniform = format.codec().is_some();
     let is_blocks = matches!(format, Format::Bc4 | Format::Bc7);
     let is_bytes = is_blocks || format == Format::Unorm8;
-    let asks_for_bytes = job.settings.quality.is_size() && !is_uniform;
+    let asks_for_bytes = job.settings.quality().is_size() && !is_uniform;
     let list = [
         (
             asks_for_bytes && why.contains("cannot be reached, the least is"),

@@ -73,7 +73,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 grid.active.psnr.map_or("exact".to_owned(), |db| format!("{db:.2}")),
                 grid.active.max_error / grid.peak,
             );
-            if way.settings.format == Format::Unorm8 && way.range == Some(RangeMode::Brick) {
+            if way.settings.format() == Format::Unorm8 && way.range == Some(RangeMode::Brick) {
                 print_tree(name, &pack);
             }
             rows.push(json!({ "volume": name, "format": way.name, "range": range, "seconds": seconds, "pack": pack,
@@ -88,14 +88,14 @@ fn ways() -> Vec<Way> {
     for (name, quality) in
         [("adaptive (default)", Quality::default()), ("adaptive, 45 dB", Quality::Psnr(45.0))]
     {
-        let settings = Settings { quality, ..Settings::default() };
+        let settings = Settings { encoding: quality.into(), ..Settings::default() };
         ways.push(Way { name: name.to_owned(), range: None, settings });
     }
     for format in Format::ALL.into_iter().filter(|format| *format != Format::Adaptive) {
         let is_normalised = format.codec().is_some_and(Codec::is_normalised);
         for range in [RangeMode::Brick, RangeMode::Sequence] {
             if is_normalised || range == RangeMode::Brick {
-                let settings = Settings { format, range, ..Settings::default() };
+                let settings = Settings { encoding: format.into(), range, ..Settings::default() };
                 ways.push(Way {
                     name: format.name().to_owned(),
                     range: is_normalised.then_some(range),

@@ -45,7 +45,11 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     for format in [Format::Adaptive, Format::Bc7, Format::Unorm8, Format::F16] {
         for frames in [short, &long[..]] {
             let path = folder.path().join("bench.volpack");
-            let settings = Settings { format, quality: Quality::Psnr(45.0), ..Settings::default() };
+            let encoding = match format {
+                Format::Adaptive => Quality::Psnr(45.0).into(),
+                uniform => uniform.into(),
+            };
+            let settings = Settings { encoding, ..Settings::default() };
             build(&Job::new(frames.to_vec(), path.clone(), settings, VerifyLevel::None), &mut Silent)?;
             let pack = Pack::open(&path)?;
             let (file_bytes, gpu_bytes) = (pack.file_bytes() as f64, pack.gpu_bytes() as f64);

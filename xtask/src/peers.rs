@@ -137,8 +137,11 @@ type Psnrs = (f64, Vec<Option<f64>>);
 fn our_psnrs(args: &Args, files: &[PathBuf], pack: &Path) -> Result<Psnrs, Box<dyn Error>> {
     let (mut peak, mut psnrs) = (0.0, Vec::new());
     for format in [Format::F16, Format::Unorm8, Format::Adaptive] {
-        let quality = Quality::Psnr(45.0);
-        let settings = Settings { format, grids: vec![args.grid.clone()], quality, ..Settings::default() };
+        let encoding = match format {
+            Format::Adaptive => Quality::Psnr(45.0).into(),
+            uniform => uniform.into(),
+        };
+        let settings = Settings { encoding, grids: vec![args.grid.clone()], ..Settings::default() };
         let job = Job::new(files.to_vec(), pack.to_owned(), settings, VerifyLevel::Voxels);
         let report = build(&job, &mut Silent)?.verification.ok_or("the build returned no verification")?;
         peak = report.grids[0].peak;

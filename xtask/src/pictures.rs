@@ -38,7 +38,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             let job = Job::new(
                 frames.clone(),
                 folder.path().join("bench.volpack"),
-                Settings { format, ..Settings::default() },
+                Settings { encoding: format.into(), ..Settings::default() },
                 VerifyLevel::None,
             );
             build(&job, &mut Silent)?;

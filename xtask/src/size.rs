@@ -7,7 +7,7 @@ use serde_json::{Value as Json, json};
 use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::report::PackSummary;
-use volpack::settings::{Format, Quality, Settings};
+use volpack::settings::{Encoding, Format, Quality, Settings};
 use volpack::sweep::nanovdb::{self, NanoGrid, Quantise};
 use volpack::sweep::{Difference, difference};
 
@@ -42,11 +42,11 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     println!("|---|---|---|---|---|---|---|---|---|");
     for file in &args.files {
         let name = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        let bc7 = pack(file, args, Format::Bc7, Quality::default(), folder.path())?;
+        let bc7 = pack(file, args, Format::Bc7.into(), folder.path())?;
         for &target in &args.psnr {
             let (tolerance, theirs, error) = fpn(file, args, target, bc7.peak, folder.path())?;
             let psnr = error.psnr(bc7.peak).ok_or("a lossy grid")?;
-            let ours = pack(file, args, Format::Adaptive, Quality::Psnr(psnr), folder.path())?;
+            let ours = pack(file, args, Quality::Psnr(psnr).into(), folder.path())?;
             let kib = |bytes: u64| bytes as f64 / 1024.0;
             println!(
                 "| {name} | NanoVDB fpN -a {tolerance:.5} | {psnr:.2} | {:.2} | {:.1} | {:.1} | {:.1} | {:.3} | {:.3} |",
@@ -60,7 +60,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             rows.push(json!({ "volume": name, "beside": "NanoVDB fpN", "tolerance": tolerance, "psnr": psnr,
                 "leaf_bytes": theirs.leaf_bytes, "grid_bytes": theirs.grid_bytes, "ours": ours.json }));
         }
-        let ours = pack(file, args, Format::Adaptive, Quality::Psnr(bc7.psnr), folder.path())?;
+        let ours = pack(file, args, Quality::Psnr(bc7.psnr).into(), folder.path())?;
         println!(
             "| {name} | uniform bc7 | {:.2} | {:.2} | | {:.1} | {:.1} | | {:.3} |",
             bc7.psnr,
@@ -84,17 +84,11 @@ struct Measured {
     json: Json,
 }
 
-fn pack(
-    file: &Path,
-    args: &Args,
-    format: Format,
-    quality: Quality,
-    folder: &Path,
-) -> Result<Measured, Box<dyn Error>> {
+fn pack(file: &Path, args: &Args, encoding: Encoding, folder: &Path) -> Result<Measured, Box<dyn Error>> {
     let job = Job::new(
         vec![file.to_owned()],
         folder.join("bench.volpack"),
-        Settings { grids: vec![args.grid.clone()], format, quality, ..Settings::default() },
+        Settings { grids: vec![args.grid.clone()], encoding, ..Settings::default() },
         VerifyLevel::Voxels,
     );
     let report = build(&job, &mut Silent)?.verification.ok_or("the build returned no verification")?;

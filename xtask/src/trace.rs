@@ -113,7 +113,7 @@ impl Bench<'_> {
         let mut packs = Vec::new();
         for format in Format::ALL {
             let output = self.folder.join(format!("{}.volpack", format.name()));
-            let settings = Settings { format, ..Settings::default() };
+            let settings = Settings { encoding: format.into(), ..Settings::default() };
             build(
                 &Job::new(vec![path.to_owned()], output.clone(), settings, VerifyLevel::None),
                 &mut Silent,
