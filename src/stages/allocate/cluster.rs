@@ -92,6 +92,7 @@ pub fn clustered(
             allocation.error_l2s.put(id, &[brick.error_l2(&decoded[shape as usize], &texel_mask)])?;
         }
     }
+    allocation.error_l2s.flush()?;
     Ok(allocation)
 }
 
