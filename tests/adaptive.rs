@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 use common::{animation, fixture};
 use reseal::reseal;
 use volpack::error::Error;
-use volpack::pack::{Pack, Region};
+use volpack::pack::{Pack, Provenance, Region};
 use volpack::pipeline::{Job, Outcome, Silent, VerifyLevel, build};
 use volpack::settings::{Clustering, FRAME_MARGIN_DB, Format, NonFinite, Quality, Settings};
 use volpack::sweep::{Options, stability};
@@ -222,7 +222,7 @@ fn the_floor_that_nobody_named_helps_the_worst_frame() {
 /// found without the verifier.
 fn largest_errors(case: &Case, pack: &Pack) -> Vec<f64> {
     let of_grid = |g: usize| {
-        let (grid, provenance) = (&pack.grids[g], pack.provenance().unwrap());
+        let (grid, provenance) = (&pack.grids()[g], Provenance::of(&pack).unwrap());
         let (mut worst, mut min, mut max) = (0.0f64, f64::INFINITY, f64::NEG_INFINITY);
         let mut active = |value: f32| (min, max) = (min.min(value.into()), max.max(value.into()));
         for (f, frame) in grid.frames.iter().enumerate() {
@@ -261,7 +261,7 @@ fn largest_errors(case: &Case, pack: &Pack) -> Vec<f64> {
         }
         worst / if max > min { max - min } else { 1.0 }
     };
-    (0..pack.grids.len()).map(of_grid).collect()
+    (0..pack.grids().len()).map(of_grid).collect()
 }
 
 #[test]
@@ -465,9 +465,9 @@ fn clusters_are_no_more_than_asked_and_the_same_on_any_number_of_threads() {
                 ..case.settings(Quality::default())
             };
             let built = case.build_unverified(settings.clone(), folder.path());
-            for g in 0..built.pack.grids.len() {
+            for g in 0..built.pack.grids().len() {
                 let mut shapes = HashSet::new();
-                for f in 0..built.pack.grids[g].frames.len() {
+                for f in 0..built.pack.grids()[g].frames.len() {
                     built.pack.frame_tree(g, f).for_each_region(|_, _, region| {
                         if let Region::Brick(record) = region {
                             shapes.insert(record.slot);
