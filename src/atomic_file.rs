@@ -2,12 +2,27 @@
 
 use std::fs::{self, File};
 use std::io::{self, Write};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use tempfile::NamedTempFile;
 
-use crate::error::{Error, Result};
+/// A file or a folder that could not be made, written or renamed.
+#[derive(Debug, thiserror::Error)]
+#[error("{}: {source}", path.display())]
+pub struct FileError {
+    /// Which.
+    pub path: PathBuf,
+    /// Why.
+    pub source: io::Error,
+}
+
+type Result<T> = std::result::Result<T, FileError>;
+
+fn failed(path: &Path) -> impl FnOnce(io::Error) -> FileError {
+    let path = path.to_owned();
+    move |source| FileError { path, source }
+}
 
 /// A file that was being written this long ago was left by a process that was killed.
 pub(crate) const LEFT_BEHIND: Duration = Duration::from_secs(24 * 3600);
@@ -22,15 +37,15 @@ pub(crate) fn is_temporary(path: &Path, prefix: &str) -> bool {
 /// Writes a file in one step, and makes its folder if need be.
 pub(crate) fn write(path: &Path, bytes: &[u8]) -> Result<()> {
     let mut file = beside(path)?;
-    file.write_all(bytes).map_err(Error::io(path))?;
+    file.write_all(bytes).map_err(failed(path))?;
     persist(file, path)
 }
 
 /// A file that will be moved to `path`, whose folder is made if need be.
 pub(crate) fn beside(path: &Path) -> Result<NamedTempFile> {
     let folder = folder_of(path);
-    fs::create_dir_all(folder).map_err(Error::io(folder))?;
-    NamedTempFile::new_in(folder).map_err(Error::io(path))
+    fs::create_dir_all(folder).map_err(failed(folder))?;
+    NamedTempFile::new_in(folder).map_err(failed(path))
 }
 
 /// The folder that a file is in.
@@ -40,8 +55,8 @@ pub(crate) fn folder_of(path: &Path) -> &Path {
 
 /// Moves a finished file to its place, readable by all as other outputs are.
 pub(crate) fn persist(file: NamedTempFile, path: &Path) -> Result<()> {
-    make_readable(file.as_file()).map_err(Error::io(path))?;
-    file.persist(path).map(drop).map_err(|e| Error::io(path)(e.error))
+    make_readable(file.as_file()).map_err(failed(path))?;
+    file.persist(path).map(drop).map_err(|e| failed(path)(e.error))
 }
 
 /// Temporary files are made for their owner alone; what becomes of them is for everyone, as any other output.

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::atomic_file::FileError;
 use crate::cancel::Cancelled;
 use crate::codec::OutOfRange;
 use crate::pack::{Pack, PackError, ProvenanceError};
@@ -86,6 +87,12 @@ pub enum Error {
     /// A pack that does not match its source.
     #[error("{0}")]
     Verify(String),
+}
+
+impl From<FileError> for Error {
+    fn from(FileError { path, source }: FileError) -> Self {
+        Self::Io { path, source }
+    }
 }
 
 impl From<ScratchError> for Error {

@@ -34,7 +34,7 @@
 //! # Ok::<(), volpack::error::Error>(())
 //! ```
 
-mod atomic_file;
+pub mod atomic_file;
 pub mod cache;
 pub mod cancel;
 pub mod cli;

@@ -7,8 +7,7 @@ use std::time::Instant;
 
 use serde_json::{Value as Json, json};
 
-use crate::atomic_file;
-use crate::error::Result;
+use crate::atomic_file::{self, FileError};
 
 struct Recorder {
     start: Instant,
@@ -59,7 +58,7 @@ fn thread() -> u32 {
 ///
 /// # Errors
 /// When the file cannot be written.
-pub fn write(path: &Path) -> Result<()> {
+pub fn write(path: &Path) -> Result<(), FileError> {
     let Some(recorder) = RECORDER.get() else { return Ok(()) };
     let event = |done: &Done| json!({ "name": done.name, "ph": "X", "pid": 1, "tid": done.thread, "ts": done.start, "dur": done.micros });
     let spans = recorder.spans.lock().expect("nothing panics while it adds a span");

@@ -13,7 +13,7 @@ use common::{animation, fixture};
 use reseal::reseal;
 use volpack::cli::exit_code;
 use volpack::error::Error;
-use volpack::pack::{Pack, Region};
+use volpack::pack::{Pack, Provenance, Region};
 use volpack::pipeline::{Job, Outcome, Silent, VerifyLevel, build};
 use volpack::settings::{
     Clustering, Encoding, FRAME_MARGIN_DB, Format, NonFinite, Quality, Settings, UniformCodec,
@@ -235,7 +235,7 @@ fn the_floor_that_nobody_named_helps_the_worst_frame() {
 /// found without the verifier.
 fn largest_errors(case: &Case, pack: &Pack) -> Vec<f64> {
     let of_grid = |g: usize| {
-        let (grid, provenance) = (&pack.grids[g], pack.provenance().unwrap());
+        let (grid, provenance) = (&pack.grids()[g], Provenance::of(&pack).unwrap());
         let (mut worst, mut min, mut max) = (0.0f64, f64::INFINITY, f64::NEG_INFINITY);
         let mut active = |value: f32| (min, max) = (min.min(value.into()), max.max(value.into()));
         for (f, frame) in grid.frames.iter().enumerate() {
@@ -274,7 +274,7 @@ fn largest_errors(case: &Case, pack: &Pack) -> Vec<f64> {
         }
         worst / if max > min { max - min } else { 1.0 }
     };
-    (0..pack.grids.len()).map(of_grid).collect()
+    (0..pack.grids().len()).map(of_grid).collect()
 }
 
 #[test]
@@ -474,9 +474,9 @@ fn clusters_are_no_more_than_asked_and_the_same_on_any_number_of_threads() {
             let settings =
                 case.clustered(Clustering { clusters, variance: 1.0, seed, ..Clustering::default() });
             let built = case.build_unverified(settings.clone(), folder.path());
-            for g in 0..built.pack.grids.len() {
+            for g in 0..built.pack.grids().len() {
                 let mut shapes = HashSet::new();
-                for f in 0..built.pack.grids[g].frames.len() {
+                for f in 0..built.pack.grids()[g].frames.len() {
                     built.pack.frame_tree(g, f).for_each_region(|_, _, region| {
                         if let Region::Brick(record) = region {
                             shapes.insert(record.slot);

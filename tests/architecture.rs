@@ -10,19 +10,23 @@ use std::path::{Path, PathBuf};
 
 /// The rooms from the ground up. Each may know those before it, and none after it. A room is a module with all that is in
 /// it, but for what is a room of its own; the crate `volpack_x` is the room `x`.
-const ROOMS: [&str; 33] = [
+const ROOMS: [&str; 37] = [
+    "format",
     "units",
+    "cancel",
+    "progress",
+    "pods",
+    "file_stamp",
     "volume",
     "codec",
     "vdb",
     "settings",
     "component",
     "atomic_file",
-    "interrupt",
     "profile",
-    "cache",
     "pack",
     "error",
+    "cache",
     "digest",
     "sequence",
     "manifest",
@@ -33,7 +37,7 @@ const ROOMS: [&str; 33] = [
     "stages::select",
     "stages::flatten",
     "stages::dedup",
-    "stages::encodings",
+    "stages::encoder_cache",
     "stages::allocate",
     "stages::relayout",
     "stages::quantise",
@@ -59,25 +63,7 @@ const STRANGERS: [(&str, &str); 4] = [
 
 /// Imports that should not be and still are: whose, and of what. Somebody is at work on each. One that is no longer needed
 /// has to go.
-const NOT_YET: &[(&str, &str)] = &[
-    ("stages::metadata", "cache"),
-    ("stages::dedup", "cache"),
-    ("stages::encodings", "cache"),
-    ("stages::allocate", "cache"),
-    // The size of a pack depends on how it is laid out.
-    ("stages::allocate", "stages::relayout"),
-    // A section is encoded while it is written.
-    ("stages::serialise", "stages::quantise"),
-    // Circles inside a room.
-    ("stages::allocate::adaptive", "stages::allocate::search"),
-    ("stages::allocate::adaptive", "stages::allocate::size"),
-    ("pack::check", "pack::reader"),
-    ("volume::brick", "volume::frame"),
-    // The tool's one error has those of packs in it, and packs are written with these.
-    ("atomic_file", "error"),
-    ("interrupt", "error"),
-    ("profile", "error"),
-];
+const NOT_YET: &[(&str, &str)] = &[];
 
 #[test]
 fn every_import_goes_down() {

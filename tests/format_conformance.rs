@@ -149,8 +149,8 @@ fn file(name: &str, extension: &str) -> PathBuf {
 
 /// What our reader finds at each voxel of a frame.
 fn our_reader<'a>(pack: &'a Pack, frame: &Frame) -> impl FnMut(Coord) -> (f32, bool) + use<'a> {
-    let g = pack.grids.iter().position(|grid| grid.name == frame.grid).unwrap();
-    let f = pack.grids[g].frames.iter().position(|f| f.record.number == frame.frame).unwrap();
+    let g = pack.grids().iter().position(|grid| grid.name == frame.grid).unwrap();
+    let f = pack.grids()[g].frames.iter().position(|f| f.record.number == frame.frame).unwrap();
     let reader = pack.frame(g, f).unwrap();
     let mut bricks = HashMap::new();
     move |at| match reader.locate(at).0 {
@@ -243,15 +243,15 @@ fn everything_that_the_format_has_is_in_some_pack() {
         for section in bytes[64..].chunks_exact(80).take(sections) {
             say(&format!("encoding {}", section[8]));
         }
-        let numbers = pack.grids.iter().map(|grid| grid.frames.len());
+        let numbers = pack.grids().iter().map(|grid| grid.frames.len());
         for (what, holds) in [
-            ("several grids", pack.grids.len() > 1),
+            ("several grids", pack.grids().len() > 1),
             ("several frames", numbers.max() > Some(1)),
-            ("several roots", pack.grids.iter().any(|grid| grid.roots != [1; 3])),
-            ("several cells", pack.grids.iter().any(|grid| grid.cells != [1; 3] && grid.cells != [32; 3])),
-            ("a background that is not 0", pack.grids.iter().any(|grid| grid.background != 0.0)),
-            ("several pages", pack.atlases.iter().any(|atlas| atlas.slabs > atlas.page_slabs)),
-            ("several rows", pack.atlases.iter().any(|atlas| atlas.rows > 1 && atlas.columns > 1)),
+            ("several roots", pack.grids().iter().any(|grid| grid.roots != [1; 3])),
+            ("several cells", pack.grids().iter().any(|grid| grid.cells != [1; 3] && grid.cells != [32; 3])),
+            ("a background that is not 0", pack.grids().iter().any(|grid| grid.background != 0.0)),
+            ("several pages", pack.atlases().iter().any(|atlas| atlas.slabs > atlas.page_slabs)),
+            ("several rows", pack.atlases().iter().any(|atlas| atlas.rows > 1 && atlas.columns > 1)),
         ] {
             holds.then(|| say(what));
         }
@@ -260,7 +260,7 @@ fn everything_that_the_format_has_is_in_some_pack() {
         {
             say(&format!("mode {}", block.trailing_zeros()));
         }
-        for (g, grid) in pack.grids.iter().enumerate() {
+        for (g, grid) in pack.grids().iter().enumerate() {
             let mut slots = BTreeSet::new();
             for f in 0..grid.frames.len() {
                 let mut of_frame = Vec::new();
@@ -360,7 +360,7 @@ fn bless() {
 /// outside it, and all bricks cell by cell.
 fn frames(pack: &Pack, sources: &[PathBuf]) -> Vec<Frame> {
     let mut frames = Vec::new();
-    for (g, grid) in pack.grids.iter().enumerate() {
+    for (g, grid) in pack.grids().iter().enumerate() {
         for (f, frame) in grid.frames.iter().enumerate() {
             let of_source = facts(&sources[frame.record.source as usize]);
             let facts = of_source.iter().find(|facts| facts["name"] == *grid.name).unwrap();
@@ -397,7 +397,7 @@ fn frames(pack: &Pack, sources: &[PathBuf]) -> Vec<Frame> {
 
 /// The same pack with slabs of 2 × 3 bricks, two to a page: writers may choose any, and small packs have one slab else.
 fn use_small_slabs(pack: &Pack, forgery: &mut Forgery) {
-    let [old] = pack.atlases[..] else { panic!("one atlas") };
+    let [old] = pack.atlases()[..] else { panic!("one atlas") };
     let (columns, rows, page_slabs) = (2, 3, 2);
     let slabs = old.bricks.div_ceil(columns * rows);
     let new = Atlas { columns, rows, slabs, page_slabs, ..old };
@@ -417,7 +417,7 @@ fn use_small_slabs(pack: &Pack, forgery: &mut Forgery) {
         section.content = texels;
         // Texels are the first section, so a slab's number is its chunk's.
         let mut lists: Vec<Vec<u32>> = Vec::new();
-        for (g, grid) in pack.grids.iter().enumerate() {
+        for (g, grid) in pack.grids().iter().enumerate() {
             for f in 0..grid.frames.len() {
                 let mut slabs = BTreeSet::new();
                 pack.frame_tree(g, f).for_each_region(|_, _, region| {

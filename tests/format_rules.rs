@@ -19,7 +19,7 @@ use forgery::{Forgery, Part, part};
 use volpack::codec::Codec;
 use volpack::pack::layout::{AtlasRecord, Chunk, FrameRecord, GridRecord, Header, Section, encoding, kind};
 use volpack::pack::tree::{L3Record, grid, header};
-use volpack::pack::{Pack, PackError, ProvenanceError, Region};
+use volpack::pack::{Pack, PackError, Provenance, ProvenanceError, Region};
 use volpack::settings::{Format, Settings};
 use volpack::volume::{Coord, CoordBox, Mask512};
 
@@ -49,7 +49,7 @@ fn read(bytes: Vec<u8>) -> Result<Vec<(Coord, u32)>, PackError> {
     let pack = Pack::from_bytes(bytes)?;
     pack.check_chunks()?;
     let mut all = Vec::new();
-    for (g, grid) in pack.grids.iter().enumerate() {
+    for (g, grid) in pack.grids().iter().enumerate() {
         for f in 0..grid.frames.len() {
             let frame = pack.frame(g, f)?;
             let mut regions = Vec::new();
@@ -513,8 +513,8 @@ fn a_pack_is_shown_whatever_its_provenance_says_and_verified_only_if_it_is_known
 
     let pack = forged(&with("\"masks\": \"auto\",", ""));
     assert_eq!(
-        pack.provenance().unwrap(),
-        forged(&|_| {}).provenance().unwrap(),
+        Provenance::of(&pack).unwrap(),
+        Provenance::of(&forged(&|_| {})).unwrap(),
         "a missing setting has its default"
     );
     assert!(
@@ -536,8 +536,8 @@ fn a_pack_is_shown_whatever_its_provenance_says_and_verified_only_if_it_is_known
     ];
     for (change, code, why) in cases {
         let pack = forged(change);
-        let error = match pack.provenance() {
-            Ok(provenance) => provenance.source(&pack.grids[0].frames[0].record).map(drop).unwrap_err(),
+        let error = match Provenance::of(&pack) {
+            Ok(provenance) => provenance.source(&pack.grids()[0].frames[0].record).map(drop).unwrap_err(),
             Err(error) => error,
         };
         assert!(error.to_string().contains(why) && error.is_unsupported() == (code == 6), "{error}");

@@ -29,7 +29,7 @@ fn kept_packs_of_version_1_say_what_their_sources_say() {
     ] {
         let pack = Pack::open(&kept(pack)).unwrap_or_else(|e| panic!("{pack}: {e}"));
         pack.check_chunks().unwrap();
-        assert_eq!(pack.grids.len(), grids);
+        assert_eq!(pack.grids().len(), grids);
         let report =
             voxels(&pack, &Sources::find(&pack, &sources).unwrap(), 2, &mut volpack::progress::Silent)
                 .unwrap();

@@ -54,7 +54,7 @@ fn told(output: &Output) -> (i32, String) {
 
 fn frames(folder: &Path) -> Vec<i32> {
     let pack = Pack::open(&folder.join("out.volpack")).unwrap();
-    pack.grids[0].frames.iter().map(|frame| frame.record.number).collect()
+    pack.grids()[0].frames.iter().map(|frame| frame.record.number).collect()
 }
 
 #[test]
@@ -107,7 +107,7 @@ fn a_grid_of_halves_is_packed_as_it_is() {
         assert!(shown.contains("density: half, unknown") && shown.contains("0.125 to 5.625"), "{shown}");
         stdout(&build(at, &["half.vdb", "-f", "f16"]));
         let pack = Pack::open(&at.join("out.volpack")).unwrap();
-        assert_eq!(pack.grids[0].record.active_max, 5.625);
+        assert_eq!(pack.grids()[0].record.active_max, 5.625);
     }
 }
 

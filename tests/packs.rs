@@ -33,7 +33,7 @@ fn settings(grid: &str, format: Format) -> Settings {
 fn voxel(pack: &Pack, at: Coord) -> (f32, bool) {
     let frame = pack.frame(0, 0).unwrap();
     match frame.locate(at).0 {
-        Region::Background => (pack.grids[0].background, false),
+        Region::Background => (pack.grids()[0].background, false),
         Region::Constant(constant) => (constant.value, constant.active),
         Region::Brick(record) => {
             let brick = frame.decode(&record).unwrap();
@@ -46,10 +46,10 @@ fn voxel(pack: &Pack, at: Coord) -> (f32, bool) {
 /// The value of an integer grid at each active voxel, from the grids of 24 bits that it was split into.
 fn joined(pack: &Pack, at: Coord) -> i64 {
     let part = |suffix: &str| {
-        let g = pack.grids.iter().position(|grid| grid.name.ends_with(suffix))?;
+        let g = pack.grids().iter().position(|grid| grid.name.ends_with(suffix))?;
         let frame = pack.frame(g, 0).unwrap();
         Some(match frame.locate(at).0 {
-            Region::Background => pack.grids[g].background,
+            Region::Background => pack.grids()[g].background,
             Region::Constant(constant) => constant.value,
             Region::Brick(record) => frame.decode(&record).unwrap().values[at.child_index(3, 1)],
         })
@@ -244,7 +244,7 @@ fn values_past_half_are_refused_by_name() {
 fn what_frames_share_is_stored_once() {
     let folder = tempfile::tempdir().unwrap();
     let (pack, report) = build_verified(&animation(), settings("density", Format::F32), folder.path());
-    assert!(report.ok && pack.grids[0].frames.len() == 8);
+    assert!(report.ok && pack.grids()[0].frames.len() == 8);
     let all = PackSummary::new(&pack);
     assert!(all.unique_bricks < all.bricks, "the animation has a still part");
 
@@ -285,7 +285,7 @@ fn a_frame_lists_the_chunks_of_its_bricks_and_no_others() {
     let (pack, _) = build_verified(&frames, settings("density", Format::F32), folder.path());
     let atlas = pack.atlas(Codec::F32).unwrap();
     assert!(atlas.slabs > 6, "{atlas:?}");
-    for (f, frame) in pack.grids[0].frames.iter().enumerate() {
+    for (f, frame) in pack.grids()[0].frames.iter().enumerate() {
         let mut needed = BTreeSet::new();
         pack.frame_tree(0, f).for_each_region(|_, _, region| {
             if let Region::Brick(record) = region {
@@ -324,10 +324,11 @@ fn several_grids_keep_their_own_frames_and_ranges() {
     frames.push(only_density);
     let (pack, report) = build_verified(&frames, settings, folder.path());
     assert!(report.ok, "{:?}", report.failures);
-    let names: Vec<_> = pack.grids.iter().map(|g| (g.name.as_str(), g.frames.len(), g.record.fps)).collect();
+    let names: Vec<_> =
+        pack.grids().iter().map(|g| (g.name.as_str(), g.frames.len(), g.record.fps)).collect();
     assert_eq!(names, [("temperature", 8, 24.0), ("density", 9, 24.0)]);
-    assert_eq!(pack.grids[1].frames[8].record.number, 99);
-    assert_ne!(pack.grids[0].sequence, pack.grids[1].sequence);
+    assert_eq!(pack.grids()[1].frames[8].record.number, 99);
+    assert_ne!(pack.grids()[0].sequence, pack.grids()[1].sequence);
 }
 
 #[test]
@@ -345,9 +346,9 @@ fn an_empty_frame_is_a_frame() {
         .collect();
     let (pack, report) = build_verified(&frames, settings("density", Format::Bc7), folder.path());
     assert!(report.ok, "{:?}", report.failures);
-    let leaves: Vec<_> = pack.grids[0].frames.iter().map(|f| f.record.leaves > 0).collect();
+    let leaves: Vec<_> = pack.grids()[0].frames.iter().map(|f| f.record.leaves > 0).collect();
     assert_eq!(leaves, [false, true, false, true, false]);
-    assert!(pack.grids[0].frames[0].chunks.is_empty());
+    assert!(pack.grids()[0].frames[0].chunks.is_empty());
 }
 
 #[test]
@@ -362,7 +363,7 @@ fn the_tree_stays_within_its_budget() {
     ] {
         let (pack, _) = build_verified(&frames, settings(grid, Format::Unorm8), folder.path());
         let summary = PackSummary::new(&pack);
-        let grid = &pack.grids[0];
+        let grid = &pack.grids()[0];
         let cells: u64 = (0..3).map(|a| u64::from(grid.cells[a]) * u64::from(grid.roots[a])).product();
         let frames = grid.frames.len() as u64;
         // The design's budget.

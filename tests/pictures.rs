@@ -102,7 +102,7 @@ fn a_still_ball_stands_still_whatever_its_box_does() {
     {
         let pack = built(&frames, settings, folder.path());
         let shot = |f: usize| {
-            let scene = Scene::new(&pack.grids[0], f, &View::default(), Mode::Density, SIZE);
+            let scene = Scene::new(&pack.grids()[0], f, &View::default(), Mode::Density, SIZE);
             seen(&trace::<f32>(&field(&pack, f), &scene).unwrap())
         };
         let first = shot(0);
@@ -134,7 +134,8 @@ fn what_is_below_zero_absorbs_nothing() {
         let [expected, found] = [&ball, &other].map(|grid| {
             let frames = write(folder.path(), std::slice::from_ref(grid));
             let pack = built(&frames, settings(Format::F32), folder.path());
-            let scene = Scene::new(&pack.grids[0], 0, &"orbit:30,20,1".parse().unwrap(), Mode::Density, SIZE);
+            let scene =
+                Scene::new(&pack.grids()[0], 0, &"orbit:30,20,1".parse().unwrap(), Mode::Density, SIZE);
             // Their boxes differ, and with them what a camera around them would see.
             let camera = volpack::render::Camera { eye: [5.0, 3.0, 4.0], target: [1.2; 3], fov: 30.0 };
             let scene = Scene { camera, extinction: 5.0, ..scene };
@@ -168,7 +169,7 @@ fn there_is_no_surface_where_nothing_is_negative() {
         let field = field(&pack, 0);
         for interpolation in [Interpolation::Trilinear, Interpolation::Nearest] {
             for view in ["orbit:40,20,1.25", "orbit:0,0,2", "orbit:45,90,1.25"] {
-                let scene = Scene::new(&pack.grids[0], 0, &view.parse().unwrap(), Mode::Lit, SIZE);
+                let scene = Scene::new(&pack.grids()[0], 0, &view.parse().unwrap(), Mode::Lit, SIZE);
                 let scene = Scene { interpolation, ..scene };
                 let image = trace::<f32>(&field, &scene).unwrap();
                 assert!(image.pixels.iter().all(|p| p.iter().all(|v| v.is_finite())), "{view}");
@@ -202,7 +203,7 @@ fn only_rays_that_read_bc4_are_said_to() {
     let frames = write(folder.path(), &[ball(0.1, [0.0; 3], 3, [1.2; 3], 0.9)]);
     for (format, expected) in [(Format::Bc4, true), (Format::Bc7, false), (Format::F32, false)] {
         let pack = built(&frames, settings(format), folder.path());
-        let scene = Scene::new(&pack.grids[0], 0, &View::default(), Mode::Density, SIZE);
+        let scene = Scene::new(&pack.grids()[0], 0, &View::default(), Mode::Density, SIZE);
         let (image, reads_bc4) = trace_noting_bc4::<f32>(&field(&pack, 0), &scene).unwrap();
         for (pixel, reads_bc4) in image.pixels.iter().zip(&reads_bc4) {
             assert!(!reads_bc4 || expected, "{format:?}");
@@ -228,7 +229,7 @@ fn what_rounding_decides_is_told_from_what_is_wrong() {
     let pack = built(&frames, settings(Format::F32), folder.path());
     let unexplained = |f: usize, other: &dyn Fn(&DecodedFrame, &Scene) -> Image| {
         let field = field(&pack, f);
-        let scene = Scene::new(&pack.grids[0], f, &View::default(), Mode::Lit, [256; 2]);
+        let scene = Scene::new(&pack.grids()[0], f, &View::default(), Mode::Lit, [256; 2]);
         let (ours, other) = (trace::<f32>(&field, &scene).unwrap(), other(&field, &scene));
         let apart = |pixel: usize| apart(&ours.pixels[pixel][..3], &other.pixels[pixel][..3]);
         let far: Vec<usize> = (0..ours.pixels.len()).filter(|&pixel| apart(pixel) > 1e-5).collect();

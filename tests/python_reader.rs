@@ -29,8 +29,8 @@ fn ours(pack: &Pack, grid: usize, frame: usize) -> Json {
         _ => constants[usize::from(dim == 128)] += 1,
     });
     json!({
-        "grid": pack.grids[grid].name,
-        "frame": pack.grids[grid].frames[frame].record.number,
+        "grid": pack.grids()[grid].name,
+        "frame": pack.grids()[grid].frames[frame].record.number,
         "voxels": voxels,
         "active": active,
         "crc32": format!("{:08x}", crc.sum()),
@@ -67,8 +67,8 @@ fn a_reader_written_from_the_specification_sees_the_same_voxels() {
             assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
             let text = String::from_utf8(output.stdout).unwrap();
             let mut theirs = text.lines().map(|line| serde_json::from_str::<Json>(line).unwrap());
-            for grid in 0..pack.grids.len() {
-                for frame in 0..pack.grids[grid].frames.len() {
+            for grid in 0..pack.grids().len() {
+                for frame in 0..pack.grids()[grid].frames.len() {
                     assert_eq!(theirs.next().unwrap(), ours(&pack, grid, frame), "{frames:?} {format:?}");
                 }
             }

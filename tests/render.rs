@@ -27,7 +27,7 @@ fn scene(
     traversal: Traversal,
     interpolation: Interpolation,
 ) -> Scene {
-    let record = &pack.grids[0].frames[0].record;
+    let record = &pack.grids()[0].frames[0].record;
     let camera = View::default().camera(&WorldBox::around([(field.bounds, &record.transform)]));
     Scene {
         mode,
@@ -35,10 +35,10 @@ fn scene(
         camera,
         size: SIZE,
         matrix: record.transform,
-        level_set: pack.grids[0].is_level_set(),
+        level_set: pack.grids()[0].is_level_set(),
         interpolation,
         extinction: 0.5,
-        threshold: 0.05 * pack.grids[0].record.active_max,
+        threshold: 0.05 * pack.grids()[0].record.active_max,
     }
 }
 
@@ -46,7 +46,7 @@ fn scene(
 fn modes(pack: &Pack) -> impl Iterator<Item = (Mode, Interpolation)> {
     let trilinear = Mode::ALL.into_iter().map(|mode| (mode, Interpolation::Trilinear));
     let nearest = Mode::ALL.into_iter().map(|mode| (mode, Interpolation::Nearest));
-    trilinear.chain(nearest.filter(|_| pack.grids[0].is_level_set()))
+    trilinear.chain(nearest.filter(|_| pack.grids()[0].is_level_set()))
 }
 
 /// Pixels that differ by more than `tolerance` of the larger, and the largest such difference.
@@ -128,7 +128,7 @@ fn the_shader_sees_what_the_cpu_sees() {
             volpack::pipeline::build(&job, &mut volpack::pipeline::Silent).unwrap();
             let pack = Pack::open(&job.output).unwrap();
             let uploaded = gpu.upload(&pack).unwrap();
-            let frame = pack.grids[0].frames.len() - 1;
+            let frame = pack.grids()[0].frames.len() - 1;
             let reader = pack.frame(0, frame).unwrap();
             let field = DecodedFrame::from_pack(&reader).unwrap();
             assert_eq!(reader.bounds(), field.bounds);
@@ -170,11 +170,11 @@ fn pictures_look_as_they_did() {
         let settings =
             Settings { grids: vec![grid.to_owned()], encoding: Format::F16.into(), ..Settings::default() };
         let (pack, _) = build_verified(&frames, settings, folder.path());
-        let frame = pack.grids[0].frames.len() - 1;
+        let frame = pack.grids()[0].frames.len() - 1;
         let renderer = Renderer::new(&pack, Device::Auto).unwrap();
         let mode = if name == "ball" { Mode::Lit } else { Mode::Density };
         let size = [96, 96];
-        let scene = Scene::new(&pack.grids[0], frame, &View::default(), mode, size);
+        let scene = Scene::new(&pack.grids()[0], frame, &View::default(), mode, size);
         let picture = renderer.render(0, frame, &scene).unwrap().to_rgb8(mode);
 
         let golden = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/golden/{name}.png"));
@@ -219,7 +219,7 @@ fn the_gpu_decodes_any_bc7_block_as_the_cpu_does() {
     let field = DecodedFrame::from_pack(&pack.frame(0, 0).unwrap()).unwrap();
     for mode in [Mode::Density, Mode::First] {
         for view in ["orbit:40,20,0.8", "orbit:200,-35,0.8"] {
-            let scene = Scene::new(&pack.grids[0], 0, &view.parse().unwrap(), mode, [160, 160]);
+            let scene = Scene::new(&pack.grids()[0], 0, &view.parse().unwrap(), mode, [160, 160]);
             let ours = gpu.trace(&uploaded, [0, 0], field.bounds, &scene).unwrap();
             let twin = trace::<f32>(&field, &scene).unwrap();
             let (n, most) = differing(&twin, &ours, 0..4, 1e-5);

@@ -180,7 +180,7 @@ fn regions_are_counted_as_they_are_visited() {
     for seed in packs() {
         let pack = Pack::from_bytes(seed.bytes).unwrap();
         let mut visited = 0;
-        for (g, grid) in pack.grids.iter().enumerate() {
+        for (g, grid) in pack.grids().iter().enumerate() {
             for f in 0..grid.frames.len() {
                 let count = |_, _, region| visited += u64::from(matches!(region, Region::Brick(_)));
                 pack.frame_tree(g, f).for_each_region(count);

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use volpack::component::Component;
 use volpack::error::Error;
-use volpack::pack::{FrameReader, Pack, Region};
+use volpack::pack::{FrameReader, Pack, Provenance, Region};
 use volpack::report::PackSummary;
 use volpack::settings::NonFinite;
 use volpack::stages::flatten::flatten;
@@ -73,12 +73,12 @@ pub fn pack(bytes: Vec<u8>) -> bool {
         Ok(()) => true,
         Err(error) => refused(&error),
     };
-    accepted &= match pack.provenance() {
+    accepted &= match Provenance::of(&pack) {
         Ok(_) => true,
         Err(error) => refused(&error),
     };
     let summary = PackSummary::new(&pack);
-    for (g, grid) in pack.grids.iter().enumerate() {
+    for (g, grid) in pack.grids().iter().enumerate() {
         for f in 0..grid.frames.len() {
             accepted &= match pack.frame(g, f) {
                 Ok(reader) => read_frame(&reader, summary.bricks <= MAX_BRICKS),

@@ -94,7 +94,7 @@ fn check(
     let pack = Pack::open(&job.output).map_err(Error::pack(&job.output))?;
     let found = outcome.verification.as_ref();
     let build = outcome.build_report();
-    let Provenance { settings, sources, .. } = &pack.provenance().map_err(Error::provenance(&pack))?;
+    let Provenance { settings, sources, .. } = &Provenance::of(&pack).map_err(Error::provenance(&pack))?;
     let figures = Figures::new(sources, &outcome.summary, found, Some(&build));
     let (figures_of, build) = (&figures, Some(&build));
     let checked =

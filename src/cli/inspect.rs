@@ -9,7 +9,7 @@ use clap::Args;
 use super::style::{ERROR, TITLE, WARNING};
 use super::{outln, print_json};
 use crate::error::{Error, Result};
-use crate::pack::{Pack, layout};
+use crate::pack::{Pack, Provenance, layout};
 use crate::report::{GridSummary, PackSummary, TopologySummary, VdbSummary};
 use crate::units::{bytes, count};
 use crate::vdb::ValueType;
@@ -110,7 +110,7 @@ fn print_topology(t: &TopologySummary) {
 }
 
 fn print_pack(path: &Path, pack: &Pack, summary: &PackSummary) {
-    let (by, unreadable) = match pack.provenance() {
+    let (by, unreadable) = match Provenance::of(pack) {
         Ok(provenance) => (format!(", by {} {}", provenance.tool, provenance.version), None),
         Err(error) => (String::new(), Some(error)),
     };
@@ -123,7 +123,7 @@ fn print_pack(path: &Path, pack: &Pack, summary: &PackSummary) {
     if let Some(error) = unreadable {
         outln!("  {ERROR}{error}{ERROR:#}");
     }
-    for grid in &pack.grids {
+    for grid in pack.grids() {
         let r = &grid.record;
         let numbers: Vec<i32> = grid.frames.iter().map(|f| f.record.number).collect();
         let frames = match (numbers.first(), numbers.last()) {

@@ -68,7 +68,7 @@ pub fn run(args: &RenderArgs, common: Common) -> Result<()> {
     if args.output.canonicalize().is_ok_and(|o| args.pack.canonicalize().is_ok_and(|p| o == p)) {
         return Err(Error::Usage(format!("{} is the pack and the picture too", args.output.display())));
     }
-    let names: Vec<&str> = pack.grids.iter().map(|g| g.name.as_str()).collect();
+    let names: Vec<&str> = pack.grids().iter().map(|g| g.name.as_str()).collect();
     let grid = args.grid.as_ref().map_or(Some(0), |name| names.iter().position(|n| n == name));
     let grid = grid.ok_or_else(|| {
         Error::Usage(format!("{}: no such grid; it has {}", args.pack.display(), names.join(", ")))
@@ -80,20 +80,20 @@ pub fn run(args: &RenderArgs, common: Common) -> Result<()> {
         anstream::eprintln!("tracing with {}{why}", renderer.device_name());
     }
 
-    let mode = args.mode.unwrap_or(Mode::of_grid(&pack.grids[grid]));
+    let mode = args.mode.unwrap_or(Mode::of_grid(&pack.grids()[grid]));
     let mut pictures = Vec::new();
     let mut steps = 0.0;
     for &frame in &frames {
         let scene = Scene {
             traversal: args.traversal,
             interpolation: args.interpolation,
-            ..Scene::new(&pack.grids[grid], frame, &args.camera, mode, args.size)
+            ..Scene::new(&pack.grids()[grid], frame, &args.camera, mode, args.size)
         };
         let image = renderer.render(grid, frame, &scene).map_err(|e| gpu_error(e, &args.pack))?;
         steps += image.mean_steps() / frames.len() as f64;
         pictures.push(image.to_rgb8(mode));
     }
-    write(args, &pictures, pack.grids[grid].record.fps)?;
+    write(args, &pictures, pack.grids()[grid].record.fps)?;
     if !common.quiet {
         let what = if frames.len() == 1 { "1 frame".to_owned() } else { format!("{} frames", frames.len()) };
         let title = style::TITLE;
@@ -103,7 +103,7 @@ pub fn run(args: &RenderArgs, common: Common) -> Result<()> {
 }
 
 fn frames(args: &RenderArgs, pack: &Pack, grid: usize) -> Result<Vec<usize>> {
-    let all = &pack.grids[grid].frames;
+    let all = &pack.grids()[grid].frames;
     let none = |what: String| Error::Usage(format!("{}: {what}", args.pack.display()));
     match (args.frames, args.frame) {
         (Some(Frames::All), _) => Ok((0..all.len()).collect()),
@@ -137,7 +137,7 @@ fn write(args: &RenderArgs, pictures: &[Vec<u8>], fps: f32) -> Result<()> {
             write_png(out, size, &sheet).map_err(failed())?;
         }
     }
-    atomic_file::persist(file, &args.output)
+    Ok(atomic_file::persist(file, &args.output)?)
 }
 
 /// Frames left to right and top to bottom, in a sheet about as wide as it is high.

@@ -15,7 +15,7 @@ use crate::cache::Cache;
 use crate::digest::digest;
 use crate::error::{Error, Result};
 use crate::manifest::{DEFAULT_NAME, expand};
-use crate::pack::Pack;
+use crate::pack::{Pack, Provenance};
 use crate::pipeline::{Job, Outcome, Resources, VerifyLevel, build, check_structure, verify_against};
 use crate::report::model::{AssetReport, Figures, Report};
 use crate::report::{
@@ -168,7 +168,7 @@ impl Gathering<'_> {
                 return Err(Error::Verify(format!("verification failed: {}", report.failures.join("; "))));
             }
             let pack = Pack::open(&job.output).map_err(Error::pack(&job.output))?;
-            let provenance = pack.provenance().map_err(Error::provenance(&pack))?;
+            let provenance = Provenance::of(&pack).map_err(Error::provenance(&pack))?;
             let figures =
                 Figures::new(&provenance.sources, &outcome.summary, outcome.verification.as_ref(), None);
             if self.args.no_cheaper {
@@ -216,7 +216,7 @@ impl Gathering<'_> {
     /// Reports a pack that is there.
     fn look(&mut self, name: &str, path: &Path, sources: &[PathBuf]) -> Result<AssetReport> {
         let pack = check_structure(path)?;
-        let provenance = pack.provenance().map_err(Error::provenance(&pack))?;
+        let provenance = Provenance::of(&pack).map_err(Error::provenance(&pack))?;
         let mut reporter = Reporter::new(name, self.common.quiet);
         let files = (!sources.is_empty()).then_some(sources);
         let pictures = PictureSettings::default();

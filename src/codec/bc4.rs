@@ -7,7 +7,8 @@
 //! brick's range has palette steps finer than that, which an encoder of bytes cannot use. It is 1.1 to 1.3 dB better
 //! than intel_tex_2's on whole volumes (docs/decisions/0007-own-bc4-encoder.md).
 
-use super::plain::{texel_order, texel_order_mut};
+use super::normalise::normalise;
+use super::plain::texel_order;
 use super::{SequenceRange, Texels};
 use crate::volume::BRICK_VOXELS;
 
@@ -22,7 +23,7 @@ const STEPS: f32 = 7.0;
 pub(super) fn encode(sequence: &SequenceRange, batch: &[Texels]) -> Vec<u8> {
     let mut out = Vec::with_capacity(batch.len() * BRICK_VOXELS / TEXELS * BLOCK);
     for brick in batch {
-        let codes = sequence.normalise(brick.range, &brick.values).map(|fraction| fraction * 255.0);
+        let codes = normalise(sequence, brick.range, &brick.values).map(|fraction| fraction * 255.0);
         let weights = brick.texel_mask.weights();
         let (codes, weights) = (texel_order(&codes), texel_order(&weights));
         for block in 0..BRICK_VOXELS / TEXELS {
@@ -141,31 +142,6 @@ impl Block {
         let slope = (n * sxy - sx * sy) / determinant;
         let low = (sy - slope * sx) / n;
         [low + slope, low]
-    }
-}
-
-pub(super) fn decode(bytes: &[u8], out: &mut [f32; BRICK_VOXELS]) {
-    let mut out = texel_order_mut(out);
-    for (i, block) in bytes.as_chunks::<BLOCK>().0.iter().enumerate() {
-        let (z, by, bx) = (i / 4, i / 2 % 2, i % 2);
-        let mut texels = [0f32; 16];
-        bcdec_rs::bc4_float(block, &mut texels, 4, false);
-        for (t, texel) in texels.into_iter().enumerate() {
-            out[[z, by * 4 + t / 4, bx * 4 + t % 4]] = texel;
-        }
-    }
-}
-
-/// How far a GPU's reading of each voxel may be from [`decode`]'s, before the brick's range is applied.
-///
-/// Measured on an NVIDIA H200 and on Mesa's software Vulkan: up to 2.84/255 of the distance of a block's
-/// endpoints for the palette of 8 values. 0.03 of it and one step of 255 is above both.
-pub(super) fn spread(bytes: &[u8], out: &mut [f32; BRICK_VOXELS]) {
-    let mut out = texel_order_mut(out);
-    for (i, block) in bytes.as_chunks::<BLOCK>().0.iter().enumerate() {
-        let (z, by, bx) = (i / 4, i / 2 % 2, i % 2);
-        let spread = (0.03 * f32::from(block[0].abs_diff(block[1])) + 1.0) / 255.0;
-        out.slice_mut(ndarray::s![z, by * 4..by * 4 + 4, bx * 4..bx * 4 + 4]).fill(spread);
     }
 }
 

@@ -6,10 +6,12 @@
 //! with the least squared error is kept.
 
 use intel_tex_2::RgbaSurface;
+use volpack_format::codec::{PACKING_STRIDES, decode_texels};
 
 use super::blocks::by_slice;
+use super::normalise::normalise;
 use super::plain::unorm8;
-use super::{Encoded, SequenceRange, Texels};
+use super::{Codec, Encoded, SequenceRange, Texels};
 use crate::volume::BRICK_VOXELS;
 
 const BLOCK: usize = 16;
@@ -20,13 +22,9 @@ const WIDTH: usize = 16;
 /// Surfaces are at least this wide: the encoder runs a row through its SIMD lanes.
 const LEAST_WIDTH: usize = 64;
 
-/// For each packing axis, how far apart in a brick two voxels are that are neighbours along it, down a slice (`v`) and
-/// across it (`u`): those two are the other axes in ascending order.
-const STRIDES: [[usize; 3]; 3] = [[64, 1, 8], [8, 1, 64], [1, 8, 64]];
-
 pub(super) fn encode(sequence: &SequenceRange, batch: &[Texels]) -> Encoded {
     let fractions: Vec<[f32; BRICK_VOXELS]> =
-        batch.iter().map(|brick| sequence.normalise(brick.range, &brick.values)).collect();
+        batch.iter().map(|brick| normalise(sequence, brick.range, &brick.values)).collect();
     let unorms: Vec<[u8; BRICK_VOXELS]> = fractions.iter().map(unorm8).collect();
     let by_axis = [0, 1, 2].map(|axis| encode_axis(&unorms, axis));
 
@@ -36,7 +34,7 @@ pub(super) fn encode(sequence: &SequenceRange, batch: &[Texels]) -> Encoded {
         let counts = brick.texel_mask.weights();
         let error = |axis: u8| {
             let mut decoded = [0f32; BRICK_VOXELS];
-            decode(bytes(axis), axis, &mut decoded);
+            decode_texels(Codec::Bc7, bytes(axis), axis, &mut decoded);
             let squares: [f64; BRICK_VOXELS] = std::array::from_fn(|i| {
                 let error = (f64::from(decoded[i]) - f64::from(fractions[i])) * f64::from(counts[i]);
                 error * error
@@ -58,7 +56,7 @@ fn encode_axis(bricks: &[[u8; BRICK_VOXELS]], axis: usize) -> Vec<u8> {
     let width = (WIDTH * bricks.len()).max(LEAST_WIDTH);
     let mut surface = vec![0u8; width * 8 * 4];
     for (b, brick) in bricks.iter().enumerate() {
-        let [along, down, across] = STRIDES[axis];
+        let [along, down, across] = PACKING_STRIDES[axis];
         for a in 0..8 {
             for v in 0..8 {
                 let row = (v * width + b * WIDTH + a / 4 * 8) * 4 + a % 4;
@@ -76,29 +74,3 @@ fn encode_axis(bricks: &[[u8; BRICK_VOXELS]], axis: usize) -> Vec<u8> {
     );
     by_slice(&blocks, width, BLOCK, bricks.len() * 2)
 }
-
-pub(super) fn decode(bytes: &[u8], axis: u8, out: &mut [f32; BRICK_VOXELS]) {
-    let [along, down, across] = STRIDES[usize::from(axis)];
-    for (i, block) in bytes.as_chunks::<BLOCK>().0.iter().enumerate() {
-        let (slice, bv, bu) = (i / 4, i / 2 % 2, i % 2);
-        let mut texels = [0u8; 64];
-        bcdec_rs::bc7(block, &mut texels, 16);
-        for (t, channels) in texels.as_chunks::<4>().0.iter().enumerate() {
-            let at = (bv * 4 + t / 4) * down + (bu * 4 + t % 4) * across;
-            for (c, &unorm) in channels.iter().enumerate() {
-                out[(slice * 4 + c) * along + at] = FRACTIONS[usize::from(unorm)];
-            }
-        }
-    }
-}
-
-/// 255ths.
-const FRACTIONS: [f32; 256] = {
-    let mut fractions = [0.0; 256];
-    let mut i = 0;
-    while i < 256 {
-        fractions[i] = i as f32 / 255.0;
-        i += 1;
-    }
-    fractions
-};

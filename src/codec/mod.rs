@@ -1,4 +1,4 @@
-//! Encode and decode of one brick: the only room that knows texel maths.
+//! Encodes bricks: the only room that knows how values become texels. [`volpack_format::codec`] decodes them.
 //!
 //! A codec turns a brick's 512 values into a fixed number of bytes that lie as a GPU texture's texels
 //! or blocks do, and back into exactly the values that the texture unit gives. Bytes of one brick
@@ -7,90 +7,15 @@
 mod bc4;
 mod bc7;
 mod blocks;
+mod normalise;
 mod plain;
-mod range;
 
 use rayon::prelude::*;
 
-pub use range::{BrickRange, SequenceRange};
+pub use volpack_format::Half;
+pub use volpack_format::codec::{BrickLayout, BrickRange, Codec, SequenceRange, decode, spread};
 
 use crate::volume::{BRICK_VOXELS, Brick, Mask512};
-
-/// How a brick's values are stored. The numbers are the pack's codec tags.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
-#[repr(u8)]
-pub enum Codec {
-    /// No texels: one value, in the L3 record.
-    Constant = 0,
-    /// BC7 blocks, four neighbours along the packing axis in R, G, B and A: 2 bits a voxel.
-    Bc7 = 1,
-    /// BC4 blocks, one slice per z: 4 bits a voxel.
-    Bc4 = 2,
-    /// One byte a voxel.
-    Unorm8 = 3,
-    /// Half floats, values as they are.
-    F16 = 4,
-    /// Floats, values as they are.
-    F32 = 5,
-}
-
-impl Codec {
-    /// Every codec that has texels, in the order of their tags.
-    pub const WITH_TEXELS: [Self; 5] = [Self::Bc7, Self::Bc4, Self::Unorm8, Self::F16, Self::F32];
-
-    /// The codec with this tag.
-    pub fn from_tag(tag: u32) -> Option<Self> {
-        [Self::Constant].into_iter().chain(Self::WITH_TEXELS).find(|c| *c as u32 == tag)
-    }
-
-    /// Its name in manifests and reports.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Constant => "constant",
-            Self::Bc7 => "bc7",
-            Self::Bc4 => "bc4",
-            Self::Unorm8 => "unorm8",
-            Self::F16 => "f16",
-            Self::F32 => "f32",
-        }
-    }
-
-    /// Whether texels are fractions of the brick's range rather than values.
-    pub fn is_normalised(self) -> bool {
-        matches!(self, Self::Bc7 | Self::Bc4 | Self::Unorm8)
-    }
-
-    /// How one brick lies in a texture.
-    pub fn layout(self) -> BrickLayout {
-        let (slices, block_dim, block_bytes) = match self {
-            Self::Constant => (0, 1, 0),
-            Self::Bc7 => (2, 4, 16),
-            Self::Bc4 => (8, 4, 8),
-            Self::Unorm8 => (8, 1, 1),
-            Self::F16 => (8, 1, 2),
-            Self::F32 => (8, 1, 4),
-        };
-        BrickLayout { slices, rows: 8 / block_dim, row_bytes: 8 / block_dim * block_bytes }
-    }
-}
-
-/// One brick in a texture: 8 × 8 texels in each of some slices.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct BrickLayout {
-    /// Slices of 8 × 8 texels.
-    pub slices: usize,
-    /// Rows of blocks (or of texels) in a slice.
-    pub rows: usize,
-    /// Bytes of one row.
-    pub row_bytes: usize,
-}
-
-impl BrickLayout {
-    /// Bytes of one brick.
-    pub fn brick_bytes(&self) -> usize {
-        self.slices * self.rows * self.row_bytes
-    }
-}
 
 /// A brick ready to be encoded.
 pub struct Texels {
@@ -164,55 +89,6 @@ fn encode_batch(codec: Codec, sequence: &SequenceRange, batch: &[Texels]) -> Res
         Codec::F32 => plain::encode_f32(batch),
     };
     Ok(Encoded { bytes, axes: plain_axes })
-}
-
-/// Decodes one brick's texels to the values that a GPU reads, x slowest. `bytes` must be
-/// [`BrickLayout::brick_bytes`] long.
-pub fn decode(
-    codec: Codec,
-    bytes: &[u8],
-    axis: u8,
-    sequence: &SequenceRange,
-    range: BrickRange,
-) -> Box<[f32; BRICK_VOXELS]> {
-    let mut out = Box::new([0.0; BRICK_VOXELS]);
-    match codec {
-        Codec::Constant => {}
-        Codec::Bc7 => bc7::decode(bytes, axis, &mut out),
-        Codec::Bc4 => bc4::decode(bytes, &mut out),
-        Codec::Unorm8 => plain::decode(bytes, |[byte]| f32::from(byte) / 255.0, &mut out),
-        Codec::F16 => plain::decode_f16(bytes, &mut out),
-        Codec::F32 => plain::decode(bytes, f32::from_le_bytes, &mut out),
-    }
-    if codec.is_normalised() {
-        let value = sequence.decoder(range);
-        out.iter_mut().for_each(|v| *v = value(*v));
-    }
-    out
-}
-
-/// How far a GPU's arithmetic may be from [`decode`]'s, of the largest number in it, `lo + span · (m/65535 + e · t)`: four
-/// roundings of 2⁻²⁴ here, there as many and a division that WGSL allows 2.5 units in the last place (5 · 2⁻²⁴).
-const ARITHMETIC: f32 = 16.0 / (1 << 24) as f32;
-
-/// For each voxel, how far what a GPU reads may be from what [`decode`] gives, in the grid's units.
-pub fn spread(
-    codec: Codec,
-    bytes: &[u8],
-    sequence: &SequenceRange,
-    range: BrickRange,
-) -> Box<[f32; BRICK_VOXELS]> {
-    let mut out = Box::new([0.0; BRICK_VOXELS]);
-    if codec == Codec::Bc4 {
-        bc4::spread(bytes, &mut out);
-        let extent = sequence.span * range.extent.to_f32();
-        out.iter_mut().for_each(|s| *s *= extent);
-    }
-    if codec.is_normalised() {
-        let arithmetic = ARITHMETIC * (sequence.lo.abs() + sequence.span);
-        out.iter_mut().for_each(|s| *s += arithmetic);
-    }
-    out
 }
 
 /// The instruction set that `intel_tex_2` picks on this machine. Its SSE and AVX paths differ in a

@@ -2,20 +2,15 @@
 
 use half::f16;
 use half::slice::HalfFloatSliceExt;
-use ndarray::{ArrayView3, ArrayViewMut3};
+use ndarray::ArrayView3;
 
+use super::normalise::normalise;
 use super::{OutOfRange, SequenceRange, Texels};
 use crate::volume::BRICK_VOXELS;
 
 /// A brick's values in the order of its texels: z slowest, x fastest.
 pub(super) fn texel_order(values: &[f32; BRICK_VOXELS]) -> ArrayView3<'_, f32> {
     let voxels = ArrayView3::from_shape((8, 8, 8), values).expect("512 values");
-    voxels.permuted_axes([2, 1, 0])
-}
-
-/// The same, to write to.
-pub(super) fn texel_order_mut(values: &mut [f32; BRICK_VOXELS]) -> ArrayViewMut3<'_, f32> {
-    let voxels = ArrayViewMut3::from_shape((8, 8, 8), values).expect("512 values");
     voxels.permuted_axes([2, 1, 0])
 }
 
@@ -44,7 +39,7 @@ fn in_texel_order<T: Copy + Default>(voxels: &[T; BRICK_VOXELS]) -> [T; BRICK_VO
 pub(super) fn encode_unorm8(sequence: &SequenceRange, batch: &[Texels]) -> Vec<u8> {
     let mut out = Vec::with_capacity(batch.len() * BRICK_VOXELS);
     for brick in batch {
-        let fractions = sequence.normalise(brick.range, &brick.values);
+        let fractions = normalise(sequence, brick.range, &brick.values);
         out.extend_from_slice(&in_texel_order(&unorm8(&fractions)));
     }
     out
@@ -70,26 +65,4 @@ pub(super) fn encode_f32(batch: &[Texels]) -> Vec<u8> {
         out.extend_from_slice(bytemuck::cast_slice(&in_texel_order(&brick.values)));
     }
     out
-}
-
-pub(super) fn decode<const N: usize>(
-    bytes: &[u8],
-    texel: impl Fn([u8; N]) -> f32,
-    out: &mut [f32; BRICK_VOXELS],
-) {
-    let texels = bytes.as_chunks::<N>().0;
-    for (i, value) in out.iter_mut().enumerate() {
-        let (x, y, z) = (i >> 6, i >> 3 & 7, i & 7);
-        *value = texel(texels[z << 6 | y << 3 | x]);
-    }
-}
-
-pub(super) fn decode_f16(bytes: &[u8], out: &mut [f32; BRICK_VOXELS]) {
-    let mut texels = [0.0; BRICK_VOXELS];
-    let halves: Vec<f16> = bytemuck::allocation::pod_collect_to_vec(bytes);
-    halves.convert_to_f32_slice(&mut texels);
-    for (i, value) in out.iter_mut().enumerate() {
-        let (x, y, z) = (i >> 6, i >> 3 & 7, i & 7);
-        *value = texels[z << 6 | y << 3 | x];
-    }
 }

@@ -1,25 +1,18 @@
-//! The `.volpack` file format: layout, writer, reader, structural checks, decoder.
+//! The `.volpack` file format: writer and provenance. The crate [`volpack_format`] reads it.
 //!
 //! `docs/format.md` is the specification.
 
-mod atlas;
-mod check;
-mod decode;
-mod error;
-pub mod layout;
+mod chunks;
 mod plan;
 mod provenance;
-mod reader;
 mod repack;
-mod tables;
-pub mod tree;
 mod writer;
 
-pub use atlas::{Atlas, MAX_TEXELS};
-pub use decode::{DecodedBrick, FrameReader, Region};
-pub use error::PackError;
+pub use chunks::check_chunks;
 pub use plan::plan;
 pub use provenance::{Provenance, ProvenanceError, Source};
-pub use reader::{Frame, Grid, Pack};
 pub use repack::{RepackError, repack};
+pub use volpack_format::{
+    Atlas, DecodedBrick, Frame, FrameReader, Grid, MAX_TEXELS, Pack, PackError, Region, layout, tree,
+};
 pub use writer::{FinishedPack, PackWriter, SectionSpec, StoredChunk, compress_chunk};

@@ -3,8 +3,8 @@
 use serde::de::IgnoredAny;
 use serde::{Deserialize, Serialize};
 
-use super::PackError;
 use super::layout::FrameRecord;
+use super::{Pack, PackError};
 use crate::settings::Settings;
 
 /// What made a pack, out of what. No paths and no times: the same input gives the same bytes.
@@ -95,6 +95,14 @@ impl Provenance {
     /// When a number in the settings is not one that JSON has.
     pub fn to_json(&self) -> std::io::Result<Vec<u8>> {
         Ok(serde_json::to_vec_pretty(self)?)
+    }
+
+    /// What a pack says of itself.
+    ///
+    /// # Errors
+    /// [`ProvenanceError::Damaged`], and those of [`Provenance::from_json`].
+    pub fn of(pack: &Pack) -> Result<Self, ProvenanceError> {
+        Self::from_json(&pack.provenance_json()?)
     }
 
     /// Reads the section's bytes. Settings that are missing have their defaults: an older volpack promised nothing of

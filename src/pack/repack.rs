@@ -5,7 +5,6 @@ use std::path::Path;
 use rayon::prelude::*;
 
 use super::layout::{CHUNK_BYTES, encoding, kind};
-use super::tables::chunk_range;
 use super::{FinishedPack, Pack, PackError, PackWriter, Provenance, SectionSpec, compress_chunk};
 use crate::cancel::{CancelToken, Cancelled};
 
@@ -49,7 +48,7 @@ pub fn repack(
         chunk_bytes: section.chunk_bytes,
         raw_bytes: section.raw_bytes,
     };
-    let specs = pack.sections.iter().map(|section| match section.kind {
+    let specs = pack.sections().iter().map(|section| match section.kind {
         kind::PROVENANCE => {
             SectionSpec { chunk_bytes: CHUNK_BYTES, raw_bytes: provenance.len() as u64, ..spec(section) }
         }
@@ -58,19 +57,19 @@ pub fn repack(
     let specs: Vec<SectionSpec> = specs.collect();
     let level = zstd_level.unwrap_or(0);
     let mut writer = PackWriter::create(path, specs.clone())?;
-    for (section, spec) in pack.sections.iter().zip(specs) {
+    for (section, spec) in pack.sections().iter().zip(specs) {
         if section.kind == kind::PROVENANCE {
             writer.section(&provenance, level)?;
             continue;
         }
         writer.begin()?;
-        let chunks: Vec<usize> = chunk_range(section).collect();
+        let chunks: Vec<usize> = section.chunk_range().collect();
         for chunks in chunks.chunks(CHUNKS_IN_FLIGHT) {
             cancel.check()?;
             let packed: Vec<_> = chunks
                 .par_iter()
                 .map(|&chunk| {
-                    let raw = pack.chunk(section, chunk)?.into_owned();
+                    let raw = pack.chunk(chunk)?.into_owned();
                     Ok(compress_chunk(raw, spec.encoding, level)?)
                 })
                 .collect::<Result<_, PackError>>()?;

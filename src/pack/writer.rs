@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 use tempfile::NamedTempFile;
+use volpack_format::tables_digest;
 
 use crate::atomic_file::{LEFT_BEHIND, folder_of, is_temporary, make_readable};
 
@@ -294,14 +295,4 @@ impl FinishedPack {
     pub fn persist(self) -> io::Result<()> {
         self.file.persist(&self.path).map(drop).map_err(|e| e.error)
     }
-}
-
-/// BLAKE3 of the tables with the header's digest zero.
-pub(super) fn tables_digest(header: &Header, sections: &[Section], chunks: &[Chunk]) -> [u8; 32] {
-    let header = Header { digest: [0; 32], ..*header };
-    let mut hasher = blake3::Hasher::new();
-    hasher.update(bytemuck::bytes_of(&header));
-    hasher.update(bytemuck::cast_slice(sections));
-    hasher.update(bytemuck::cast_slice(chunks));
-    *hasher.finalize().as_bytes()
 }

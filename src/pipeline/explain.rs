@@ -83,7 +83,7 @@ const LISTED: usize = 5;
 /// What differs between the output, if it is there, and what would be made.
 fn reasons(job: &Job, new: &Provenance) -> Vec<String> {
     let old = match Pack::open(&job.output) {
-        Ok(pack) => match pack.provenance() {
+        Ok(pack) => match Provenance::of(&pack) {
             Ok(provenance) => provenance,
             Err(e) => return vec![format!("{}: {e}", job.output.display())],
         },

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use super::{Plan, Resources};
 use crate::component::find_packed;
 use crate::error::{Error, Result};
-use crate::pack::Pack;
+use crate::pack::{Pack, Provenance};
 use crate::settings::Integers;
 use crate::units::bytes;
 use crate::vdb::{TreeSize, VdbFile};
@@ -41,9 +41,9 @@ pub(super) fn compared_at_once(pack: &Pack, sources: &[PathBuf], resources: &Res
     let most = rayon::current_num_threads();
     let Some(limit) = resources.memory else { return Ok(most) };
     let files: Vec<&Path> = sources.iter().map(|path| &**path).collect();
-    let grids: Vec<&str> = pack.grids.iter().map(|grid| &*grid.name).collect();
-    let integers = pack.provenance().map_err(Error::provenance(pack))?.settings.integers;
-    Ok(at_once(limit, size_of_val(&*pack.tree) as u64, &files, &sizes(&files, &grids, integers)?)?.min(most))
+    let grids: Vec<&str> = pack.grids().iter().map(|grid| &*grid.name).collect();
+    let integers = Provenance::of(pack).map_err(Error::provenance(pack))?.settings.integers;
+    Ok(at_once(limit, size_of_val(pack.tree()) as u64, &files, &sizes(&files, &grids, integers)?)?.min(most))
 }
 
 /// How many of the largest file's frames fit beside what is kept.

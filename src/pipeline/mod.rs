@@ -209,7 +209,7 @@ fn build_cached(
             (pack, report, false)
         }
     };
-    if reuse.is_some() && !pack.provenance().is_ok_and(|found| plan.provenance.is(&found)) {
+    if reuse.is_some() && !Provenance::of(&pack).is_ok_and(|found| plan.provenance.is(&found)) {
         return Err(Error::Misled("the pack under its key is another one".to_owned()));
     }
     clock.lap("verify");
@@ -240,7 +240,7 @@ fn warn(job: &Job, warnings: &[String], progress: &mut dyn Progress) -> Result<(
 fn empty_grids(pack: &Pack) -> Vec<String> {
     let is_empty = |grid: &&Grid| grid.frames.iter().all(|frame| frame.record.active_voxels == 0);
     let warning = |grid: &Grid| format!("grid {:?} has no active voxels in any frame", grid.name);
-    pack.grids.iter().filter(is_empty).map(warning).collect()
+    pack.grids().iter().filter(is_empty).map(warning).collect()
 }
 
 /// What a job comes to, as far as it can be told without a voxel.
@@ -411,7 +411,7 @@ pub fn verify_against(
 /// [`Error::Pack`].
 pub fn check_structure(path: &Path) -> Result<Pack> {
     let pack = Pack::open(path).map_err(Error::pack(path))?;
-    pack.check_chunks().map_err(Error::pack(path))?;
+    crate::pack::check_chunks(&pack).map_err(Error::pack(path))?;
     Ok(pack)
 }
 

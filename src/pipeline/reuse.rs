@@ -120,7 +120,7 @@ impl<'a> Reuse<'a> {
         // Its digest was right; whether it is the pack that its key says is another matter.
         let pack = Pack::open(copy.path()).ok();
         let is_wanted = |found: &Provenance| any_level(provenance).is(&any_level(found));
-        let pack = pack.filter(|pack| pack.provenance().is_ok_and(|found| is_wanted(&found)));
+        let pack = pack.filter(|pack| Provenance::of(pack).is_ok_and(|found| is_wanted(&found)));
         let pack = pack.map(|pack| repack(&pack, &job.output, provenance, level, cancel)).transpose();
         match pack {
             Ok(Some(pack)) => Ok(Reused::Pack(Made::Repacked, pack)),

@@ -133,14 +133,14 @@ impl Gpu {
     pub fn upload(&self, pack: &Pack) -> Result<Uploaded, GpuError> {
         let lacks = |what: String| GpuError::Lacks { adapter: self.name.clone(), what };
         let limits = self.device.limits();
-        let tree_bytes = pack.tree.len() as u64 * 4;
+        let tree_bytes = pack.tree().len() as u64 * 4;
         let most = limits.max_storage_buffer_binding_size.min(limits.max_buffer_size);
         if tree_bytes > most {
             return Err(lacks(format!("binds storage of {most} bytes, the pack's tree has {tree_bytes}")));
         }
         let tree = self.device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
             label: Some("tree"),
-            contents: bytemuck::cast_slice(&pack.tree),
+            contents: bytemuck::cast_slice(pack.tree()),
             usage: wgpu::BufferUsages::STORAGE,
         });
         let mut views = Vec::new();

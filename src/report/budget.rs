@@ -136,7 +136,7 @@ impl Checked<'_> {
 
     /// The largest error of each grid, in what it measures it in.
     fn errors(&self, found: &VerifyReport, bound: ErrorBound) -> Vec<Breach> {
-        let grids = found.grids.iter().zip(&self.pack.grids);
+        let grids = found.grids.iter().zip(self.pack.grids());
         let past = grids.filter_map(|(report, grid)| {
             let voxel = grid.frames.first().map_or(1.0, |frame| voxel_size(&frame.record.transform));
             let (error, limit) = (report.active.max_error, bound.absolute(report.peak, voxel));

@@ -11,7 +11,7 @@ use crate::verify::VerifyReport;
 pub(super) fn costs(pack: &Pack, found: Option<&VerifyReport>) -> Vec<FrameCost> {
     let mut seen: HashSet<(Codec, u32)> = HashSet::new();
     let mut out = Vec::new();
-    for (g, grid) in pack.grids.iter().enumerate() {
+    for (g, grid) in pack.grids().iter().enumerate() {
         for (f, frame) in grid.frames.iter().enumerate() {
             let mut shown = HashSet::new();
             pack.frame_tree(g, f).for_each_region(|_, _, region| {

@@ -91,7 +91,7 @@ pub fn gallery(
     let extinction = |grid: &Grid| {
         pictures.iter().find(|picture| picture.grid == grid.name).map(|picture| picture.extinction)
     };
-    let extinctions: Vec<Option<f64>> = pack.grids.iter().map(extinction).collect();
+    let extinctions: Vec<Option<f64>> = pack.grids().iter().map(extinction).collect();
     let key = Key::new(&STAGE, &(digest, files.is_some(), worst, &extinctions));
     if let Some(known) = cache.and_then(|cache| cache.get(&key)) {
         return Ok(known);
@@ -99,7 +99,7 @@ pub fn gallery(
     let sources = files.map(|files| Sources::find(pack, files)).transpose()?;
     let sources = sources.as_ref();
     let mut places = Vec::new();
-    for (g, grid) in pack.grids.iter().enumerate() {
+    for (g, grid) in pack.grids().iter().enumerate() {
         let is_worst = |f: usize| worst == Some((grid.name.as_str(), grid.frames[f].record.number));
         let mut shown = shown_frames(grid.frames.len());
         shown.extend((0..grid.frames.len()).find(|&f| is_worst(f)));
@@ -109,7 +109,7 @@ pub fn gallery(
     }
     let key_frame = |(place, is_worst): ([usize; 2], bool)| {
         let Some(seen) = look(pack, sources, place, extinctions[place[0]])? else { return Ok(None) };
-        Ok(Some(KeyFrame::new(&pack.grids[place[0]], place[1], is_worst, &seen)))
+        Ok(Some(KeyFrame::new(&pack.grids()[place[0]], place[1], is_worst, &seen)))
     };
     let key_frames = places.into_par_iter().map(key_frame);
     let strips = extinctions.iter().enumerate().map(|(g, extinction)| strip(pack, g, *extinction, cancel));
@@ -140,7 +140,7 @@ impl KeyFrame {
 
 /// `None` for a grid of less than two frames, where there is nothing to play, and for one that cannot be traced.
 fn strip(pack: &Pack, g: usize, extinction: Option<f64>, cancel: &CancelToken) -> Result<Option<Strip>> {
-    let grid = &pack.grids[g];
+    let grid = &pack.grids()[g];
     let all = grid.frames.len();
     if all < 2 {
         return Ok(None);

@@ -56,7 +56,7 @@ pub struct CodecSummary {
 impl PackSummary {
     /// Counts what is in a pack.
     pub fn new(pack: &Pack) -> Self {
-        let words = &pack.tree;
+        let words = pack.tree();
         let record_at = words[header::RECORD_AT] as usize;
         let record = |i: &u32| &words[record_at + *i as usize * RECORD_WORDS..][..RECORD_WORDS];
         let mut unique: Vec<u32> = (0..words[header::RECORDS]).collect();
@@ -67,13 +67,13 @@ impl PackSummary {
             let codec = Codec::from_tag(record(i)[0] & 7).expect("the pack was checked");
             codecs.entry(codec.name()).or_default().bricks += 1;
         }
-        for atlas in &pack.atlases {
+        for atlas in pack.atlases() {
             codecs.entry(atlas.codec.name()).or_default().bytes = atlas.bytes();
         }
 
         let squares = squares_by_codec(pack);
         let error: f64 = squares.iter().sum();
-        let texel_bytes: u64 = pack.atlases.iter().map(Atlas::bytes).sum();
+        let texel_bytes: u64 = pack.atlases().iter().map(Atlas::bytes).sum();
         let part = |part: f64, whole: f64| if whole > 0.0 { part / whole } else { 0.0 };
         for (tag, squares) in squares.into_iter().enumerate() {
             let codec = Codec::from_tag(tag as u32).expect("there are six");
@@ -85,15 +85,15 @@ impl PackSummary {
         }
 
         let frames: BTreeSet<i32> =
-            pack.grids.iter().flat_map(|g| g.frames.iter().map(|f| f.record.number)).collect();
+            pack.grids().iter().flat_map(|g| g.frames.iter().map(|f| f.record.number)).collect();
         // Nothing in a pack bounds what it says of its source.
-        let leaves = pack.grids.iter().flat_map(|g| g.frames.iter().map(|f| f.record.leaves));
+        let leaves = pack.grids().iter().flat_map(|g| g.frames.iter().map(|f| f.record.leaves));
         let source_leaves = leaves.fold(0, u64::saturating_add);
         let mask_bytes = u64::from(words[header::MASKS]) * MASK_WORDS as u64 * 4;
         let tree_bytes = words.len() as u64 * 4 - mask_bytes;
         let gpu_bytes = pack.gpu_bytes();
         Self {
-            grids: pack.grids.iter().map(|g| g.name.clone()).collect(),
+            grids: pack.grids().iter().map(|g| g.name.clone()).collect(),
             frames: frames.len() as u64,
             bricks: pack.region_count(),
             unique_bricks: unique.len() as u64,
@@ -117,7 +117,7 @@ impl PackSummary {
 /// What each codec cost, by tag, in squared ranges of each grid's active values.
 fn squares_by_codec(pack: &Pack) -> [f64; 6] {
     let mut squares = [0.0; 6];
-    for grid in &pack.grids {
+    for grid in pack.grids() {
         let peak = grid.peak();
         for (sum, error_l2) in squares.iter_mut().zip(grid.record.codec_error_l2s) {
             let error_l2 = f64::from(error_l2);

@@ -1,7 +1,7 @@
 //! The nearest cheaper setting of a pack, built and compared.
 
 use crate::error::{Error, Result};
-use crate::pack::{Grid, Pack};
+use crate::pack::{Grid, Pack, Provenance};
 use crate::pipeline::{Job, Progress, VerifyLevel, build};
 use crate::report::model::{Cheaper, Figures};
 use crate::settings::{Encoding, ErrorBound, Quality, Settings};
@@ -25,7 +25,7 @@ pub fn cheaper(
     progress: &mut dyn Progress,
 ) -> Result<Option<Cheaper>> {
     let most = figures.gpu_bytes;
-    let only_level_sets = pack.grids.iter().all(Grid::is_level_set);
+    let only_level_sets = pack.grids().iter().all(Grid::is_level_set);
     let Some((setting, settings)) = next(&job.settings, figures, only_level_sets) else { return Ok(None) };
     let folder = tempfile::tempdir().map_err(Error::io(std::env::temp_dir()))?;
     let mut job = job.clone();
@@ -35,7 +35,7 @@ pub fn cheaper(
     job.pictures.images = None;
     let outcome = build(&job, progress)?;
     let pack = Pack::open(&job.output).map_err(Error::pack(&job.output))?;
-    let provenance = pack.provenance().map_err(Error::provenance(&pack))?;
+    let provenance = Provenance::of(&pack).map_err(Error::provenance(&pack))?;
     let figures = Figures::new(&provenance.sources, &outcome.summary, outcome.verification.as_ref(), None);
     // One that fails verification is no offer.
     Ok((figures.ok && figures.gpu_bytes < most).then_some(Cheaper { setting, figures }))

@@ -135,7 +135,8 @@ fn point(
     )?;
     let mut jumps = Jumps::default();
     for (place, bricks) in &source.shown {
-        let Some(frame) = pack.grids[0].frames.iter().position(|f| f.record.source as usize == *place) else {
+        let Some(frame) = pack.grids()[0].frames.iter().position(|f| f.record.source as usize == *place)
+        else {
             continue;
         };
         let decoded = pack.frame(0, frame).and_then(|reader| bricks.in_pack(&reader));
@@ -166,7 +167,7 @@ fn point(
 /// The milliseconds of the last frame's picture; `None` where the device cannot hold it, or times nothing.
 fn trace(gpu: &Gpu, pack: &Pack, size: [u32; 2], repeats: u32) -> Option<f64> {
     let uploaded = gpu.upload(pack).ok()?;
-    let grid = &pack.grids[0];
+    let grid = &pack.grids()[0];
     let frame = grid.frames.len() - 1;
     let bounds = pack.frame_tree(0, frame).bounds();
     let mode = if grid.is_level_set() { Mode::Depth } else { Mode::Density };

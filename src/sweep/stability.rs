@@ -7,7 +7,7 @@ use super::noise::Noise;
 use super::points::flat_frame;
 use super::{Method, Options, Stability, each};
 use crate::error::{Error, Result};
-use crate::pack::Pack;
+use crate::pack::{Pack, Provenance};
 use crate::pipeline::{Progress, Silent, build_altered};
 use crate::report::PackSummary;
 use crate::report::chart::Spread;
@@ -142,8 +142,8 @@ fn run(options: &Options, method: &Method, variation: Variation, folder: &Path) 
 
     let pack = Pack::open(&job.output).map_err(Error::pack(&job.output))?;
     let bytes = std::fs::read(&job.output).map_err(Error::io(&job.output))?;
-    let provenance = pack.provenance().map_err(Error::provenance(&pack))?;
-    let grid = &pack.grids[0];
+    let provenance = Provenance::of(&pack).map_err(Error::provenance(&pack))?;
+    let grid = &pack.grids()[0];
     let (mut difference, mut range) = (Difference::default(), None);
     let mut jumps = [Jumps::default(); 2];
     for (f, frame) in grid.frames.iter().enumerate() {

@@ -6,42 +6,7 @@ use super::block::Compression;
 use super::cursor::Cursor;
 use super::transform::Transform;
 use super::value::ValueType;
-use super::{Result, VdbError};
-
-/// What kind of field a grid holds, from its `class` metadata.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
-pub enum GridClass {
-    /// Not stated.
-    #[default]
-    Unknown,
-    /// A narrow band signed distance.
-    LevelSet,
-    /// A density.
-    FogVolume,
-    /// A staggered velocity.
-    Staggered,
-}
-
-impl GridClass {
-    /// OpenVDB's name of the class (`GridBase::gridClassToString`).
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::Unknown => "unknown",
-            Self::LevelSet => "level set",
-            Self::FogVolume => "fog volume",
-            Self::Staggered => "staggered",
-        }
-    }
-
-    fn from_name(name: &str) -> Self {
-        match name {
-            "level set" => Self::LevelSet,
-            "fog volume" => Self::FogVolume,
-            "staggered" => Self::Staggered,
-            _ => Self::Unknown,
-        }
-    }
-}
+use super::{GridClass, Result, VdbError};
 
 /// One grid of a file.
 #[derive(Clone, Debug)]

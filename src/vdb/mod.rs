@@ -25,13 +25,14 @@ mod value;
 
 pub use error::VdbError;
 pub use file::VdbFile;
-pub use grid::{GridClass, GridInfo, find_grid};
+pub use grid::{GridInfo, find_grid};
 pub use half::f16;
 pub use other_format::OtherFormat;
 pub use stats::{TopologyStats, ValueStats};
-pub use transform::{Transform, voxel_size};
+pub use transform::Transform;
 pub use tree::{Accessor, Internal, LEAVES_IN_BLOCK, Leaves, RootTile, TileAt, Tree, TreeSize};
 pub use value::{Scalar, Value, ValueType, with_scalar_type, with_value_type};
+pub use volpack_format::{GridClass, voxel_size};
 
 /// `Result` with a [`VdbError`].
 pub type Result<T> = std::result::Result<T, VdbError>;

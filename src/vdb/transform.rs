@@ -23,12 +23,6 @@ impl Transform {
     }
 }
 
-/// The length of a voxel's shortest edge, in world units.
-pub fn voxel_size(matrix: &[f64; 16]) -> f64 {
-    let edge = |r: usize| matrix[4 * r..4 * r + 3].iter().map(|v| v * v).sum::<f64>().sqrt();
-    edge(0).min(edge(1)).min(edge(2))
-}
-
 fn read_nested(c: &mut Cursor, depth: u32) -> Result<Transform> {
     let at = c.at();
     let map = c.string("the transform's map type")?;

@@ -147,7 +147,7 @@ fn broken_psnr(promise: &Promise, grid: &GridReport, frames: &[FrameReport]) -> 
 fn broken_size(pack: &Pack, settings: &Settings) -> Option<String> {
     let bytes = pack.gpu_bytes();
     let leaves =
-        pack.grids.iter().flat_map(|g| &g.frames).map(|f| f.record.leaves).fold(0, u64::saturating_add);
+        pack.grids().iter().flat_map(|g| &g.frames).map(|f| f.record.leaves).fold(0, u64::saturating_add);
     match settings.quality() {
         Quality::Size(asked) if bytes > asked => {
             Some(format!("{bytes} bytes on the GPU exceed the {asked} that were asked"))
@@ -218,7 +218,7 @@ impl VerifyReport {
         mut failures: Vec<String>,
     ) -> Self {
         let (mut grids, mut frames) = (Vec::new(), Vec::new());
-        for (grid, (errors, is_integer)) in pack.grids.iter().zip(errors) {
+        for (grid, (errors, is_integer)) in pack.grids().iter().zip(errors) {
             let promise = Promise::new(grid, settings, is_integer);
             let peak = promise.peak;
             let (mut active, mut all) = (Error::default(), Error::default());

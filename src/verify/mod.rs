@@ -46,8 +46,8 @@ impl Sources {
     /// # Errors
     /// When one is missing, changed or unreadable, or the pack's provenance cannot be used.
     pub fn find(pack: &Pack, files: &[PathBuf]) -> Result<Self> {
-        let provenance = pack.provenance().map_err(Error::provenance(pack))?;
-        for frame in pack.grids.iter().flat_map(|grid| &grid.frames) {
+        let provenance = Provenance::of(pack).map_err(Error::provenance(pack))?;
+        for frame in pack.grids().iter().flat_map(|grid| &grid.frames) {
             provenance.source(&frame.record).map_err(Error::provenance(pack))?;
         }
         Ok(Self { files: match_sources(&provenance, files)?, provenance })
@@ -75,7 +75,7 @@ pub fn voxels(
     let settings = &provenance.settings;
     let cancel = progress.cancel_token();
     let mut found: Vec<Vec<Option<FoundFrame>>> =
-        pack.grids.iter().map(|g| g.frames.iter().map(|_| None).collect()).collect();
+        pack.grids().iter().map(|g| g.frames.iter().map(|_| None).collect()).collect();
     let mut failures = check_tables(pack, provenance);
     let places: Vec<usize> = (0..paths.len()).collect();
     for window in places.chunks(at_once) {
@@ -93,7 +93,7 @@ pub fn voxels(
         }
     }
     let mut errors = Vec::new();
-    for (grid, frames) in pack.grids.iter().zip(found) {
+    for (grid, frames) in pack.grids().iter().zip(found) {
         let frames: Vec<FoundFrame> =
             frames.into_iter().map(|f| f.expect("every frame has a source")).collect();
         failures.extend(check_class(grid, &frames));
@@ -150,7 +150,7 @@ struct FoundFrame {
 fn check_tables(pack: &Pack, provenance: &Provenance) -> Vec<String> {
     let settings = &provenance.settings;
     let mut broken = Vec::new();
-    for grid in &pack.grids {
+    for grid in pack.grids() {
         if grid.record.fps != settings.fps.unwrap_or(0.0) {
             broken.push(format!(
                 "grid {:?}: {} frames per second, {} were asked",
@@ -171,7 +171,7 @@ fn check_tables(pack: &Pack, provenance: &Provenance) -> Vec<String> {
     }
     let is_there = |name: &&String| {
         let is_part = |grid: &Grid| grid.name.rsplit_once('.').is_some_and(|(base, _)| base == **name);
-        pack.grids.iter().any(|grid| grid.name == **name || is_part(grid))
+        pack.grids().iter().any(|grid| grid.name == **name || is_part(grid))
     };
     let missing = settings.grids.iter().filter(|name| !is_there(name));
     broken.extend(missing.map(|name| format!("grid {name:?} was asked for and is not in the pack")));
@@ -221,7 +221,7 @@ fn compare_source(
 ) -> Result<(Vec<FoundFrame>, Vec<String>)> {
     let file = VdbFile::open(path).map_err(Error::vdb(path))?;
     let (mut out, mut missing) = (Vec::new(), Vec::new());
-    for (g, grid) in pack.grids.iter().enumerate() {
+    for (g, grid) in pack.grids().iter().enumerate() {
         let of_source = |f: &Frame| f.record.source as usize == source;
         let frames: Vec<usize> = (0..grid.frames.len()).filter(|&f| of_source(&grid.frames[f])).collect();
         let Some((info, component)) = find_packed(&file.grids, &grid.name, settings.integers) else {

@@ -128,7 +128,7 @@ pub fn pictures(
     if let Some(folder) = &settings.images {
         std::fs::create_dir_all(folder).map_err(Error::io(folder))?;
     }
-    for g in 0..pack.grids.len() {
+    for g in 0..pack.grids().len() {
         compare_grid(pack, sources, &renderer, g, settings, &mut report, cancel)?;
     }
     Ok(report)
@@ -157,7 +157,7 @@ fn compare_grid(
     report: &mut PicturesReport,
     cancel: &CancelToken,
 ) -> Result<()> {
-    let grid = &pack.grids[g];
+    let grid = &pack.grids()[g];
     let what = |f: usize| format!("grid {:?} frame {}", grid.name, grid.frames[f].record.number);
     let mut shown = Vec::new();
     for f in shown_frames(grid.frames.len()) {
@@ -284,13 +284,13 @@ fn is_blank(image: &Image) -> bool {
 fn packed_field(pack: &Pack, [g, f]: [usize; 2]) -> Result<DecodedFrame> {
     let field = pack.frame(g, f).and_then(|reader| DecodedFrame::from_pack(&reader));
     field.map_err(|e| {
-        let grid = &pack.grids[g];
+        let grid = &pack.grids()[g];
         Error::Verify(format!("grid {:?} frame {}: {e}", grid.name, grid.frames[f].record.number))
     })
 }
 
 fn source_field(pack: &Pack, sources: &Sources, [g, f]: [usize; 2]) -> Result<DecodedFrame> {
-    let grid = &pack.grids[g];
+    let grid = &pack.grids()[g];
     let path = sources.path(grid.frames[f].record.source);
     let file = VdbFile::open(path).map_err(Error::vdb(path))?;
     let settings = &sources.provenance.settings;
@@ -333,7 +333,7 @@ pub fn look(
     [g, f]: [usize; 2],
     extinction: Option<f64>,
 ) -> Result<Option<Seen>> {
-    let scene = scene(&pack.grids[g], f);
+    let scene = scene(&pack.grids()[g], f);
     let scene = Scene { extinction: extinction.unwrap_or(scene.extinction), ..scene };
     let draw = |field: &DecodedFrame| trace::<f32>(field, &scene).map(|image| image.to_rgb8(scene.mode));
     let Ok(of_pack) = draw(&packed_field(pack, [g, f])?) else { return Ok(None) };

@@ -1,11 +1,6 @@
 //! An 8³ block of voxels, and what its inactive voxels are.
 
-use serde::{Deserialize, Serialize};
-
-use super::Mask512;
-
-/// Voxels in a brick.
-pub const BRICK_VOXELS: usize = 512;
+use super::{BRICK_VOXELS, InactiveRule, Mask512};
 
 /// One brick of the source: every voxel's value and active state, x slowest, z fastest.
 #[derive(Clone, PartialEq)]
@@ -16,32 +11,6 @@ pub struct Brick {
     pub active: Mask512,
     /// Whether that has to be kept. Else a pack's voxel is active where its value is not the background.
     pub keeps_mask: bool,
-}
-
-/// What an inactive voxel under a mask reads as. The numbers are the pack's.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[repr(u8)]
-pub enum InactiveRule {
-    /// The background.
-    Background = 0,
-    /// The background with its sign flipped: the inside of a level set.
-    MinusBackground = 1,
-    /// Minus the background where the mask's second half is on, else the background.
-    Sign = 2,
-    /// What the texel says.
-    Texel = 3,
-}
-
-impl InactiveRule {
-    /// The rule with this number, 0 to 3.
-    pub fn from_bits(bits: u32) -> Self {
-        match bits & 3 {
-            0 => Self::Background,
-            1 => Self::MinusBackground,
-            2 => Self::Sign,
-            _ => Self::Texel,
-        }
-    }
 }
 
 impl Brick {

@@ -2,23 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{BRICK_DIM, Blocks, Brick, Coord, CoordBox};
-
-/// A region of one value.
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
-pub struct Constant {
-    /// The value of every voxel in it.
-    pub value: f32,
-    /// Whether they are active.
-    pub active: bool,
-}
-
-impl Constant {
-    /// Value and state as bits, to compare and to hash.
-    pub fn key(self) -> (u32, bool) {
-        (self.value.to_bits(), self.active)
-    }
-}
+use super::{BRICK_DIM, Blocks, Brick, Constant, Coord, CoordBox, ValueRange};
 
 /// What stands at one of an L2 node's 4096 places.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
@@ -46,45 +30,6 @@ pub struct Cell {
     pub origin: Coord,
     /// What fills it.
     pub content: CellContent,
-}
-
-/// A closed range of values.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-pub struct ValueRange {
-    /// The smallest.
-    pub min: f32,
-    /// The largest.
-    pub max: f32,
-}
-
-impl ValueRange {
-    /// The range of one value.
-    pub fn of(value: f32) -> Self {
-        Self { min: value, max: value }
-    }
-
-    /// The largest less the smallest.
-    pub fn width(self) -> f64 {
-        f64::from(self.max) - f64::from(self.min)
-    }
-
-    /// The smallest range around both.
-    pub fn union(self, other: Self) -> Self {
-        Self { min: self.min.min(other.min), max: self.max.max(other.max) }
-    }
-
-    /// What errors of a grid are measured against: the width of the range of its active values. Where they are all one, how
-    /// far that is from the background; where that is nothing either, 1.
-    pub fn peak(active: Option<Self>, background: f32) -> f64 {
-        let Some(active) = active else { return 1.0 };
-        let from_background = (f64::from(active.max) - f64::from(background)).abs();
-        [active.width(), from_background].into_iter().find(|peak| *peak > 0.0).unwrap_or(1.0)
-    }
-
-    /// The smallest range around all of them; `None` for none.
-    pub fn union_all(ranges: impl IntoIterator<Item = Self>) -> Option<Self> {
-        ranges.into_iter().reduce(Self::union)
-    }
 }
 
 /// Counts of one frame, taken from the source before anything is simplified.

@@ -4,20 +4,20 @@
 
 mod blocks;
 mod brick;
-mod coord;
 mod frame;
 mod list;
-mod mask;
 mod pool;
 mod scratch;
 mod sparse;
 
 pub use blocks::Blocks;
-pub use brick::{BRICK_VOXELS, Brick, InactiveRule};
-pub use coord::{BRICK_DIM, CELL_DIM, Coord, CoordBox, ROOT_DIM};
-pub use frame::{Cell, CellContent, Child, Constant, FlatFrame, FrameStats, ValueRange};
+pub use brick::Brick;
+pub use frame::{Cell, CellContent, Child, FlatFrame, FrameStats};
 pub use list::List;
-pub use mask::{Mask512, bits};
 pub use pool::{BRICKS_IN_FLIGHT, BrickPool, Interner};
 pub use scratch::{SCRATCH_SMALL, Scratch, ScratchError, ScratchFolder, ScratchResult};
 pub use sparse::SortedMap;
+pub use volpack_format::{
+    BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, CoordBox, InactiveRule, Mask512, ROOT_DIM,
+    ValueRange, bits,
+};

@@ -54,7 +54,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
             let pack = Pack::open(&path)?;
             let (file_bytes, gpu_bytes) = (pack.file_bytes() as f64, pack.gpu_bytes() as f64);
             // The densest frame.
-            let leaves = |frame: &usize| pack.grids[0].frames[*frame].record.leaves;
+            let leaves = |frame: &usize| pack.grids()[0].frames[*frame].record.leaves;
             let frame = (0..frames.len()).max_by_key(leaves).ok_or("no frames")?;
             let (mut whole, mut open, mut one, mut vdb) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
             for _ in 0..args.rounds {
@@ -91,7 +91,8 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
 /// Loads all data for the GPU: the tree and each slab of each atlas, checked and decompressed.
 fn load(path: &Path) -> Result<(), Box<dyn Error>> {
     let pack = Pack::open(path)?;
-    let slabs: Vec<_> = pack.atlases.iter().flat_map(|a| (0..a.slabs).map(|slab| (a.codec, slab))).collect();
+    let slabs: Vec<_> =
+        pack.atlases().iter().flat_map(|a| (0..a.slabs).map(|slab| (a.codec, slab))).collect();
     slabs.into_par_iter().try_for_each(|(codec, slab)| pack.slab(codec, slab).map(drop))?;
     Ok(())
 }

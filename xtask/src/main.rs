@@ -23,6 +23,7 @@ mod size;
 mod stress;
 mod sweep;
 mod trace;
+mod wasm;
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -59,6 +60,8 @@ enum Task {
     Mutate(mutate::Args),
     /// Kill builds, damage the cache and run builds in parallel, and check that the packs stay the same
     StressCache(stress::Args),
+    /// Read the conformance packs in WebAssembly under node, and compare with the same read natively
+    Wasm,
     /// Read files and print the time (`bench read` runs this)
     #[command(hide = true)]
     ReadOnce(read::OnceArgs),
@@ -115,6 +118,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         Task::CheckOpenvdb { files } => openvdb::check(&files),
         Task::StressCache(args) => stress::run(&args),
         Task::Mutate(args) => mutate::run(args),
+        Task::Wasm => wasm::check(),
         Task::ReadOnce(args) => read::once(&args),
     }
 }

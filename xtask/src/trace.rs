@@ -120,7 +120,7 @@ impl Bench<'_> {
             )?;
             packs.push((format, Pack::open(&output)?));
         }
-        let grid = &packs[0].1.grids[0];
+        let grid = &packs[0].1.grids()[0];
         for &(shows, mode, interpolation) in if grid.is_level_set() { LEVEL_SET } else { FOG } {
             let scene = Scene { interpolation, ..Scene::new(grid, 0, &VIEW, mode, self.size) };
             let theirs = self.theirs(path, &grid.name, shows, &scene)?;

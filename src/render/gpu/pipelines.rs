@@ -26,7 +26,7 @@ impl Has {
         let used = Codec::WITH_TEXELS.into_iter().filter(|codec| pack.atlas(*codec).is_some());
         Self {
             codecs: used.fold(1, |bits, codec| bits | 1 << codec as u32),
-            masks: pack.tree[header::MASKS] > 0,
+            masks: pack.tree()[header::MASKS] > 0,
         }
     }
 }

@@ -13,13 +13,12 @@ use std::collections::btree_map::Entry;
 use std::ops::Range;
 
 use bytemuck::{Pod, Zeroable};
-use half::f16;
 use ndarray::Array2;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::cancel::CancelToken;
-use crate::codec::{BrickRange, SequenceRange, decode};
+use crate::codec::{BrickRange, Half, SequenceRange, decode};
 use crate::error::Result;
 use crate::pods;
 use crate::profile;
@@ -201,7 +200,7 @@ impl Comparison {
                 let extent = BrickRange::from_word(offer.range).extent;
                 (offer.referenced as usize) < self.referenced_bricks.len()
                     && extent.is_finite()
-                    && extent > f16::ZERO
+                    && extent > Half::ZERO
             })
     }
 
@@ -456,7 +455,7 @@ fn borrow(sequence: &SequenceRange, brick: &Brick, mean: f64, referenced: &Lende
     // The minimum is coarse and may have met an end of the range: the extent makes the best of it.
     let rest = lo + span * min / 65535.0;
     let dot = sum(|i| (f64::from(values[i]) - rest) * f64::from(texels[i]));
-    let extent = f16::from_f64(dot / referenced.squares / span);
-    let is_ahead = extent.is_finite() && extent > f16::ZERO;
+    let extent = Half::from_f64(dot / referenced.squares / span);
+    let is_ahead = extent.is_finite() && extent > Half::ZERO;
     is_ahead.then_some(BrickRange { min: min as u16, extent })
 }

@@ -3,13 +3,13 @@
 use std::borrow::Cow;
 use std::collections::HashMap;
 
-use super::error::ensure;
-use super::tables::fits_memory;
-use super::tree::{self, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS, header, l1_words};
-use super::{Atlas, Frame, Grid, Pack, PackError};
 use crate::codec::{BrickRange, Codec, decode, spread};
-use crate::volume::{
-    BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, CoordBox, InactiveRule, Mask512, ROOT_DIM,
+use crate::error::ensure;
+use crate::tables::fits_memory;
+use crate::tree::{self, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS, header, l1_words};
+use crate::{
+    Atlas, BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, CoordBox, Frame, Grid, InactiveRule, Mask512,
+    Pack, PackError, ROOT_DIM, check,
 };
 
 /// The deepest thing that the tree has at some place.
@@ -48,26 +48,29 @@ impl Pack {
     /// # Panics
     /// When there is no such frame.
     pub fn frame(&self, grid: usize, frame: usize) -> Result<FrameReader<'_>, PackError> {
-        let chunks = &self.grids[grid].frames[frame].chunks;
+        let chunks = &self.grids()[grid].frames[frame].chunks;
         let bytes = chunks.iter().map(|&chunk| self.chunk_bytes(chunk));
         let (raw, stored) = bytes.fold((0, 0), |(raw, stored), (r, s)| (raw + r, stored + s));
         // Rule 14.
         ensure(fits_memory(raw, stored), || format!("frame {frame} claims to unpack to {raw} bytes"))?;
         let mut slabs = HashMap::with_capacity(chunks.len());
         for &chunk in chunks {
-            let section = self.texels_of(chunk).expect("chunk lists were checked when the pack was opened");
-            slabs.insert(chunk as usize, self.chunk(section, chunk as usize)?);
+            slabs.insert(chunk as usize, self.chunk(chunk as usize)?);
         }
         Ok(FrameReader { pack: self, grid, frame, slabs })
     }
 
     /// What a GPU has to hold: tree, masks and texture pages.
     pub fn gpu_bytes(&self) -> u64 {
-        self.tree.len() as u64 * 4 + self.atlases.iter().map(Atlas::bytes).sum::<u64>()
+        self.tree().len() as u64 * 4 + self.atlases().iter().map(Atlas::bytes).sum::<u64>()
     }
 
     /// One frame's tree without its texels: regions can be found, bricks not decoded.
+    ///
+    /// # Panics
+    /// When there is no such frame.
     pub fn frame_tree(&self, grid: usize, frame: usize) -> FrameReader<'_> {
+        assert!(frame < self.grids()[grid].frames.len(), "there is no frame {frame} in grid {grid}");
         FrameReader { pack: self, grid, frame, slabs: HashMap::new() }
     }
 
@@ -76,14 +79,14 @@ impl Pack {
     /// Takes as long as the tree is, not as what it stands for: a few nodes that name each other often
     /// are more regions than anyone could visit.
     pub fn region_count(&self) -> u64 {
-        let words = &self.tree;
+        let words = self.tree();
         let ones = |mask: &[u32]| mask.iter().map(|w| u64::from(w.count_ones())).sum::<u64>();
         let nodes = words[words[header::NODE_AT] as usize..].chunks_exact(NODE_WORDS);
         let in_node: Vec<u64> =
             nodes.take(words[header::NODES] as usize).map(|node| ones(&node[..128])).collect();
         let mut total = 0u64;
         let mut in_l1: HashMap<(u32, usize), u64> = HashMap::new();
-        for grid in &self.grids {
+        for grid in self.grids() {
             let cells = grid.cell_count();
             let (mask_words, rank_words) = l1_words(cells);
             for &root in &words[grid.root_words()] {
@@ -107,7 +110,7 @@ impl Pack {
 impl FrameReader<'_> {
     /// The frame's grid.
     pub fn grid(&self) -> &Grid {
-        &self.pack.grids[self.grid]
+        &self.pack.grids()[self.grid]
     }
 
     /// The frame.
@@ -116,7 +119,7 @@ impl FrameReader<'_> {
     }
 
     fn words(&self) -> &[u32] {
-        &self.pack.tree
+        self.pack.tree()
     }
 
     fn constant(&self, index: u32, active: bool) -> Constant {
@@ -247,8 +250,9 @@ impl FrameReader<'_> {
     /// Decodes a record's 512 voxels.
     ///
     /// # Errors
-    /// When its texels are not among the chunks that the frame lists.
+    /// When its texels are not among the chunks that the frame lists, or it is no record of this pack.
     pub fn decode(&self, record: &L3Record) -> Result<DecodedBrick, PackError> {
+        self.check(record)?;
         let grid = self.grid();
         let mut values = if record.codec == Codec::Constant {
             Box::new([f32::from_bits(record.word2); BRICK_VOXELS])
@@ -278,8 +282,9 @@ impl FrameReader<'_> {
     /// For each voxel of a record, how far what a GPU reads may be from [`FrameReader::decode`].
     ///
     /// # Errors
-    /// When its texels are not among the chunks that the frame lists.
+    /// When its texels are not among the chunks that the frame lists, or it is no record of this pack.
     pub fn spread(&self, record: &L3Record) -> Result<Box<[f32; BRICK_VOXELS]>, PackError> {
+        self.check(record)?;
         if record.codec == Codec::Constant {
             return Ok(Box::new([0.0; BRICK_VOXELS]));
         }
@@ -287,11 +292,17 @@ impl FrameReader<'_> {
         Ok(spread(record.codec, &self.texels(record)?, &self.grid().sequence, range))
     }
 
+    /// Those of the tree were checked when the pack was opened; a caller may have made one up, or mixed up two packs.
+    fn check(&self, record: &L3Record) -> Result<(), PackError> {
+        check::l3_record(self.pack, record)
+            .map_err(|what| PackError::Corrupt(format!("an L3 record: {what}")))
+    }
+
     /// Rule 47.
     fn texels(&self, record: &L3Record) -> Result<Vec<u8>, PackError> {
-        let atlas = self.pack.atlas(record.codec).expect("records were checked when the pack was opened");
+        let atlas = self.pack.atlas(record.codec).expect("the record was checked");
         let (slab, place) = (record.slot / atlas.slab_bricks(), record.slot % atlas.slab_bricks());
-        let loaded = self.pack.slab_chunk(record.codec, slab).and_then(|(_, chunk)| self.slabs.get(&chunk));
+        let loaded = self.pack.slab_chunk(record.codec, slab).and_then(|chunk| self.slabs.get(&chunk));
         let slab = loaded.ok_or_else(|| {
             PackError::Corrupt(format!("frame {} does not list the chunk of a brick it uses", self.frame))
         })?;

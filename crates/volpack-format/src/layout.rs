@@ -1,5 +1,7 @@
 //! The fixed-layout records of a pack, little-endian, as `docs/format.md` has them.
 
+use std::ops::Range;
+
 use bytemuck::{Pod, Zeroable};
 
 #[cfg(target_endian = "big")]
@@ -60,6 +62,13 @@ pub struct Section {
     pub raw_bytes: u64,
     /// BLAKE3 of its entries in the chunk table.
     pub digest: [u8; 32],
+}
+
+impl Section {
+    /// Its chunks, by their places in the chunk table.
+    pub fn chunk_range(&self) -> Range<usize> {
+        self.first_chunk as usize..self.first_chunk as usize + self.chunks as usize
+    }
 }
 
 /// One chunk: the unit of reading, checking and decompression.

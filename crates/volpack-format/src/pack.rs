@@ -1,24 +1,22 @@
-//! Maps a pack and gives its parts, each checked before it is used.
+//! Opens a pack and gives its parts, each checked before it is used.
 
 use std::borrow::Cow;
-use std::fs::File;
-use std::ops::Range;
+use std::io::{Read, Seek};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use bytemuck::Pod;
 use bytemuck::allocation::zeroed_vec;
-use memmap2::Mmap;
 
-use super::atlas::{Atlas, MAX_TEXELS};
-use super::error::{corrupt, ensure};
-use super::layout::{AtlasRecord, Chunk, FrameRecord, GridRecord, Section, encoding, kind};
-use super::tables::{chunk_range, fits_memory, read_tables};
-use super::tree::header;
-use super::{PackError, Provenance, ProvenanceError, check};
-use crate::codec::{Codec, SequenceRange};
-use crate::vdb::{GridClass, voxel_size};
-use crate::volume::{Coord, ROOT_DIM, ValueRange};
+use crate::atlas::MAX_TEXELS;
+use crate::codec::Codec;
+use crate::error::{corrupt, ensure};
+use crate::grid::{Frame, Grid};
+use crate::layout::{AtlasRecord, Chunk, FrameRecord, GridRecord, Section, encoding, kind};
+use crate::source::Source;
+use crate::tables::{fits_memory, read_tables};
+use crate::tree::header;
+use crate::{Atlas, PackError, check, zstd};
 
 /// An open pack.
 ///
@@ -27,117 +25,26 @@ use crate::volume::{Coord, ROOT_DIM, ValueRange};
 /// numbers the rules.
 pub struct Pack {
     path: PathBuf,
-    bytes: Bytes,
-    /// The grids.
-    pub grids: Vec<Grid>,
-    /// The tree's words.
-    pub tree: Vec<u32>,
-    /// The texture pages, one entry a codec that is used.
-    pub atlases: Vec<Atlas>,
-    pub(super) sections: Vec<Section>,
+    source: Source,
+    grids: Vec<Grid>,
+    tree: Vec<u32>,
+    atlases: Vec<Atlas>,
+    sections: Vec<Section>,
     chunks: Vec<Chunk>,
     /// The texel section's place for each of `atlases`.
     texel_sections: Vec<usize>,
     checked: Vec<AtomicBool>,
 }
 
-enum Bytes {
-    Mapped(Mmap),
-    Memory(Vec<u8>),
-}
-
-impl std::ops::Deref for Bytes {
-    type Target = [u8];
-    fn deref(&self) -> &[u8] {
-        match self {
-            Self::Mapped(map) => map,
-            Self::Memory(bytes) => bytes,
-        }
-    }
-}
-
-/// One grid of a pack.
-#[derive(Clone, Debug)]
-pub struct Grid {
-    /// Its name.
-    pub name: String,
-    /// Its entry in the grid table.
-    pub record: GridRecord,
-    /// Its frames.
-    pub frames: Vec<Frame>,
-    /// The value outside everything.
-    pub background: f32,
-    /// The range that brick ranges are fractions of.
-    pub sequence: SequenceRange,
-    /// The smallest corner of what its L1 nodes cover.
-    pub origin: Coord,
-    /// 128³ cells of an L1 node, an axis.
-    pub cells: [u32; 3],
-    /// L1 nodes of a frame, an axis.
-    pub roots: [u32; 3],
-    /// The word of the tree at which its frames' roots begin.
-    pub root_at: usize,
-}
-
-/// One frame of a grid.
-#[derive(Clone, Debug)]
-pub struct Frame {
-    /// Its entry in the frame table.
-    pub record: FrameRecord,
-    /// The texel chunks that it needs, by their place in the chunk table.
-    pub chunks: Vec<u32>,
-}
-
-impl Grid {
-    /// The words of the tree that link to its frames' L1 nodes.
-    pub(super) fn root_words(&self) -> Range<usize> {
-        self.root_at..self.root_at + self.root_count() * self.record.frames as usize
-    }
-
-    /// Whether each of its L1 nodes covers a cube that OpenVDB has a root entry for, so that one value may stand for it.
-    pub(super) fn has_whole_roots(&self) -> bool {
-        self.cells == [32; 3] && self.origin.is_aligned(ROOT_DIM)
-    }
-
-    /// L1 nodes of a frame.
-    pub(super) fn root_count(&self) -> usize {
-        self.roots.iter().map(|r| *r as usize).product()
-    }
-
-    /// Whether its zero is a surface.
-    pub fn is_level_set(&self) -> bool {
-        self.record.class == GridClass::LevelSet as u32
-    }
-
-    /// What errors are measured against: see [`ValueRange::peak`].
-    pub fn peak(&self) -> f64 {
-        let active = ValueRange { min: self.record.active_min, max: self.record.active_max };
-        let has_active = self.frames.iter().any(|frame| frame.record.active_voxels > 0);
-        ValueRange::peak(has_active.then_some(active), self.background)
-    }
-
-    /// The smallest side of a voxel in any frame, in world units.
-    pub fn voxel_size(&self) -> f64 {
-        self.frames.iter().map(|frame| voxel_size(&frame.record.transform)).fold(f64::INFINITY, f64::min)
-    }
-
-    /// 128³ cells of an L1 node.
-    pub(super) fn cell_count(&self) -> usize {
-        self.cells.iter().map(|c| *c as usize).product()
-    }
-}
-
 impl Pack {
-    /// Opens and checks a pack.
+    /// Opens and checks a pack, which is mapped into memory. Its file must not be written to while it is open; packs are
+    /// replaced by renaming.
     ///
     /// # Errors
     /// [`PackError`].
+    #[cfg(feature = "mmap")]
     pub fn open(path: &Path) -> Result<Self, PackError> {
-        let file = File::open(path)?;
-        // SAFETY: the map is only read. Another process that cuts the file short while it is mapped
-        // can kill this one with SIGBUS; packs are replaced by renaming, never written in place.
-        let map = unsafe { Mmap::map(&file)? };
-        Self::parse(path.to_owned(), Bytes::Mapped(map))
+        Self::parse(path.to_owned(), Source::map(path)?)
     }
 
     /// The same for a pack that is in memory.
@@ -145,7 +52,36 @@ impl Pack {
     /// # Errors
     /// [`PackError`].
     pub fn from_bytes(bytes: Vec<u8>) -> Result<Self, PackError> {
-        Self::parse(PathBuf::from("(in memory)"), Bytes::Memory(bytes))
+        Self::parse(PathBuf::from("(in memory)"), Source::Memory(bytes))
+    }
+
+    /// The same for a stream, which a pack begins and ends with: a file, or a client of a server that gives parts of one.
+    /// Only the tables and the tree are read now, other chunks whenever they are asked for. One is read at a time.
+    ///
+    /// # Errors
+    /// [`PackError`].
+    pub fn from_reader(stream: impl Read + Seek + Send + 'static) -> Result<Self, PackError> {
+        Self::parse(PathBuf::from("(a stream)"), Source::stream(stream)?)
+    }
+
+    /// The grids.
+    pub fn grids(&self) -> &[Grid] {
+        &self.grids
+    }
+
+    /// The tree's words, which a shader binds as they are: see [`crate::tree`].
+    pub fn tree(&self) -> &[u32] {
+        &self.tree
+    }
+
+    /// The texture pages, one entry a codec that is used.
+    pub fn atlases(&self) -> &[Atlas] {
+        &self.atlases
+    }
+
+    /// The sections, those that this reader does not know too, in the order of the file.
+    pub fn sections(&self) -> &[Section] {
+        &self.sections
     }
 
     /// The file that it was opened from, for messages.
@@ -153,24 +89,25 @@ impl Pack {
         &self.path
     }
 
-    /// Where the pack comes from. It is read when it is asked for, since no voxel depends on it.
+    /// Where the pack comes from, as the JSON that `docs/format.md` describes, unparsed. It is read when it is asked for,
+    /// since no voxel depends on it.
     ///
     /// # Errors
-    /// [`ProvenanceError`].
-    pub fn provenance(&self) -> Result<Provenance, ProvenanceError> {
+    /// When its bytes are damaged, or would take all memory.
+    pub fn provenance_json(&self) -> Result<Vec<u8>, PackError> {
         let section = self.section(kind::PROVENANCE)?;
         ensure(fits_memory(section.raw_bytes, section.stored_bytes), || {
             format!("the provenance claims to unpack to {} bytes", section.raw_bytes) // Rule 14.
         })?;
-        Provenance::from_json(&self.records(kind::PROVENANCE)?)
+        self.records(kind::PROVENANCE)
     }
 
-    fn parse(path: PathBuf, bytes: Bytes) -> Result<Self, PackError> {
-        let (sections, chunks) = read_tables(&bytes)?;
+    fn parse(path: PathBuf, source: Source) -> Result<Self, PackError> {
+        let (sections, chunks) = read_tables(&source)?;
         let mut pack = Self {
             checked: chunks.iter().map(|_| AtomicBool::new(false)).collect(),
             path,
-            bytes,
+            source,
             grids: Vec::new(),
             tree: Vec::new(),
             atlases: Vec::new(),
@@ -289,8 +226,8 @@ impl Pack {
         })?;
         let mut records: Vec<T> = zeroed_vec(section.raw_bytes as usize / size_of::<T>());
         let mut rest: &mut [u8] = bytemuck::cast_slice_mut(&mut records);
-        for chunk in chunk_range(section) {
-            let chunk = self.chunk(section, chunk)?;
+        for chunk in section.chunk_range() {
+            let chunk = self.chunk_of(section, chunk)?;
             // The tables were found to agree about lengths.
             let (now, later) = rest.split_at_mut(chunk.len());
             now.copy_from_slice(&chunk);
@@ -299,12 +236,32 @@ impl Pack {
         Ok(records)
     }
 
-    /// A chunk's bytes as they were before they were packed.
-    pub(super) fn chunk(&self, section: &Section, index: usize) -> Result<Cow<'_, [u8]>, PackError> {
+    /// How many chunks the pack has, of every section.
+    pub fn chunk_count(&self) -> usize {
+        self.chunks.len()
+    }
+
+    /// A chunk's bytes as they were before they were packed, by its place in the chunk table.
+    ///
+    /// # Errors
+    /// When it is damaged, or there is no such chunk.
+    pub fn chunk(&self, index: usize) -> Result<Cow<'_, [u8]>, PackError> {
+        self.chunk_of(self.section_of(index)?, index)
+    }
+
+    /// The section that a chunk belongs to. Sections have the chunks of the table in order, and all of them.
+    fn section_of(&self, chunk: usize) -> Result<&Section, PackError> {
+        let place = self.sections.partition_point(|section| section.chunk_range().end <= chunk);
+        let none = || PackError::Corrupt(format!("there is no chunk {chunk}"));
+        self.sections.get(place).ok_or_else(none)
+    }
+
+    fn chunk_of(&self, section: &Section, index: usize) -> Result<Cow<'_, [u8]>, PackError> {
         let chunk = &self.chunks[index];
-        let stored = &self.bytes[chunk.offset as usize..][..chunk.stored_bytes as usize];
-        if !self.checked[index].load(Ordering::Relaxed) {
-            if *blake3::hash(stored).as_bytes() != chunk.digest {
+        let stored = self.source.read(chunk.offset, chunk.stored_bytes.into())?;
+        // What a stream gives may be something else the next time.
+        if !self.source.is_in_memory() || !self.checked[index].load(Ordering::Relaxed) {
+            if *blake3::hash(&stored).as_bytes() != chunk.digest {
                 // Rule 15.
                 return Err(PackError::Digest {
                     what: format!("chunk {index} ({})", kind::name(section.kind)),
@@ -313,16 +270,12 @@ impl Pack {
             self.checked[index].store(true, Ordering::Relaxed);
         }
         if section.encoding == encoding::RAW || chunk.stored_bytes == chunk.raw_bytes {
-            return Ok(Cow::Borrowed(stored));
+            return Ok(stored);
         }
-        // Rule 16. zstd's own decoder takes several frames too, which other readers do not.
-        let frame = zstd::zstd_safe::find_frame_compressed_size(stored);
-        ensure(frame.is_ok_and(|bytes| bytes == stored.len()), || {
-            format!("chunk {index} does not unpack: it is not one zstd frame")
-        })?;
         let raw_bytes = chunk.raw_bytes as usize;
-        let raw = zstd::bulk::decompress(stored, raw_bytes)
-            .map_err(|e| PackError::Corrupt(format!("chunk {index} does not unpack: {e}")))?;
+        // Rule 16.
+        let raw = zstd::decompress(&stored, raw_bytes)
+            .map_err(|what| PackError::Corrupt(format!("chunk {index} does not unpack: {what}")))?;
         if raw.len() != raw_bytes {
             return corrupt(format!("chunk {index} unpacks to {} bytes, not {raw_bytes}", raw.len()));
         }
@@ -335,32 +288,31 @@ impl Pack {
     /// The bytes of a slab, as they are uploaded.
     ///
     /// # Errors
-    /// When its chunk is damaged.
-    ///
-    /// # Panics
-    /// When there is no such slab.
+    /// When its chunk is damaged, or there is no such slab.
     pub fn slab(&self, codec: Codec, slab: u32) -> Result<Cow<'_, [u8]>, PackError> {
-        let (section, chunk) = self.slab_chunk(codec, slab).expect("the slab exists");
-        self.chunk(section, chunk)
+        match self.slab_chunk(codec, slab) {
+            Some(chunk) => self.chunk(chunk),
+            None => corrupt(format!("there is no slab {slab} of {}", codec.name())),
+        }
     }
 
-    /// The texels section that a chunk belongs to.
-    pub(super) fn texels_of(&self, chunk: u32) -> Option<&Section> {
-        let sections = self.texel_sections.iter().map(|&place| &self.sections[place]);
-        sections.into_iter().find(|section| chunk_range(section).contains(&(chunk as usize)))
+    /// Whether there is such a chunk, with texels in it.
+    pub(crate) fn is_texels(&self, chunk: u32) -> bool {
+        let mut sections = self.texel_sections.iter().map(|&place| &self.sections[place]);
+        sections.any(|section| section.chunk_range().contains(&(chunk as usize)))
     }
 
     /// Bytes of a chunk: decoded, and in the file.
-    pub(super) fn chunk_bytes(&self, chunk: u32) -> (u64, u64) {
+    pub(crate) fn chunk_bytes(&self, chunk: u32) -> (u64, u64) {
         let chunk = &self.chunks[chunk as usize];
         (chunk.raw_bytes.into(), chunk.stored_bytes.into())
     }
 
-    /// The texel section of a codec and the place of a slab's chunk.
-    pub(super) fn slab_chunk(&self, codec: Codec, slab: u32) -> Option<(&Section, usize)> {
+    /// The place of a slab's chunk.
+    pub(crate) fn slab_chunk(&self, codec: Codec, slab: u32) -> Option<usize> {
         let place = self.atlases.iter().position(|a| a.codec == codec)?;
         let section = &self.sections[self.texel_sections[place]];
-        (slab < section.chunks).then_some((section, section.first_chunk as usize + slab as usize))
+        (slab < section.chunks).then_some(section.first_chunk as usize + slab as usize)
     }
 
     /// The atlas of a codec.
@@ -368,22 +320,30 @@ impl Pack {
         self.atlases.iter().find(|a| a.codec == codec)
     }
 
-    /// Checks every chunk's digest and decodes each, those that nothing asked for yet too.
+    /// Checks one chunk's digest and decodes it, by its place in the chunk table. Many may be checked at the same time.
+    ///
+    /// # Errors
+    /// When it is damaged, or there is no such chunk.
+    pub fn check_chunk(&self, index: usize) -> Result<(), PackError> {
+        let section = self.section_of(index)?;
+        // Sections of a kind that this reader does not know may be stored in a way that it does not know.
+        if !kind::is_known(section.kind) {
+            return Ok(());
+        }
+        self.chunk_of(section, index).map(drop)
+    }
+
+    /// The same for every chunk, those that nothing asked for yet too, one after another.
     ///
     /// # Errors
     /// The first chunk that is damaged.
     pub fn check_chunks(&self) -> Result<(), PackError> {
-        use rayon::prelude::*;
-        // Sections of a kind that this reader does not know may be stored in a way that it does not know.
-        let known = self.sections.par_iter().filter(|s| kind::is_known(s.kind));
-        known.try_for_each(|section| {
-            chunk_range(section).into_par_iter().try_for_each(|index| self.chunk(section, index).map(drop))
-        })
+        (0..self.chunk_count()).try_for_each(|index| self.check_chunk(index))
     }
 
     /// Bytes of the file.
     pub fn file_bytes(&self) -> u64 {
-        self.bytes.len() as u64
+        self.source.len()
     }
 
     /// Those of them that texels take.

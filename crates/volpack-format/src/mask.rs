@@ -1,12 +1,8 @@
 //! Bit masks, in OpenVDB's order: bit `n` of a brick is voxel `x << 6 | y << 3 | z`.
 
-use serde::{Deserialize, Serialize};
-
 /// One bit for each voxel of a brick.
-#[derive(
-    Clone, Copy, PartialEq, Eq, Hash, bytemuck::Pod, bytemuck::Zeroable, Default, Serialize, Deserialize,
-)]
-#[serde(transparent)]
+#[derive(Clone, Copy, PartialEq, Eq, Hash, bytemuck::Pod, bytemuck::Zeroable, Default)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(transparent))]
 #[repr(transparent)]
 pub struct Mask512(pub [u64; 8]);
 

@@ -4,24 +4,23 @@
 
 use std::ops::Range;
 
-use super::error::{corrupt, ensure};
-use super::layout::{FrameRecord, GridRecord};
-use super::tree::{
+use crate::codec::{BrickRange, Codec, SequenceRange};
+use crate::error::{corrupt, ensure};
+use crate::layout::{FrameRecord, GridRecord};
+use crate::tree::{
     self, GRID_WORDS, HEADER_WORDS, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS, grid, header,
     l1_words,
 };
-use super::{Grid, Pack, PackError};
-use crate::codec::{BrickRange, Codec, SequenceRange};
-use crate::volume::{CELL_DIM, Coord, InactiveRule};
+use crate::{CELL_DIM, Coord, Grid, InactiveRule, Pack, PackError};
 
 /// So many entries of a table from the first on.
-pub(super) fn range(first: u32, count: u32) -> Range<usize> {
+pub(crate) fn range(first: u32, count: u32) -> Range<usize> {
     first as usize..first as usize + count as usize
 }
 
 /// Rules 32, 33 and 40: parts of a table lie inside it, and none serves twice. Were the same entries to serve many, a
 /// small file could take all memory or any time.
-pub(super) fn parts(
+pub(crate) fn parts(
     parts: impl Iterator<Item = Range<usize>>,
     len: usize,
     what: &str,
@@ -34,7 +33,7 @@ pub(super) fn parts(
 }
 
 /// Rules 34 and 35, once frames are known to lie inside their table.
-pub(super) fn frame_order(grids: &[GridRecord], frames: &[FrameRecord]) -> Result<(), PackError> {
+pub(crate) fn frame_order(grids: &[GridRecord], frames: &[FrameRecord]) -> Result<(), PackError> {
     let place = |frame: &FrameRecord| (frame.grid, frame.number);
     ensure(frames.is_sorted_by(|a, b| place(a) < place(b)), || {
         "the frame table is not ordered by grid and number".to_owned()
@@ -58,8 +57,8 @@ fn area(words: &[u32], at: usize, count: usize, size: usize, what: &str) -> Resu
 }
 
 /// Checks the tree's header, L3 records and L2 nodes: rules 22, 23 and 25 to 31.
-pub(super) fn tree(pack: &Pack) -> Result<(), PackError> {
-    let words = &pack.tree;
+pub(crate) fn tree(pack: &Pack) -> Result<(), PackError> {
+    let words = pack.tree();
     if words.len() < HEADER_WORDS || words[header::WORDS] as usize != words.len() {
         return corrupt("the tree is not as long as it says");
     }
@@ -76,7 +75,10 @@ pub(super) fn tree(pack: &Pack) -> Result<(), PackError> {
         })?;
     }
     for (i, record) in words[records.clone()].chunks_exact(RECORD_WORDS).enumerate() {
-        l3_record(pack, record, count(header::MASKS))
+        let record = L3Record::from_words([record[0], record[1], record[2]]);
+        record
+            .ok_or("unknown codec".to_owned())
+            .and_then(|record| l3_record(pack, &record))
             .map_err(|what| PackError::Corrupt(format!("L3 record {i}: {what}")))?;
     }
     for (i, node) in words[nodes].chunks_exact(NODE_WORDS).enumerate() {
@@ -94,9 +96,9 @@ fn ones(mask: &[u32]) -> usize {
     mask.iter().map(|word| word.count_ones() as usize).sum()
 }
 
-/// Rules 26 to 29.
-fn l3_record(pack: &Pack, words: &[u32], masks: usize) -> Result<(), String> {
-    let record = L3Record::from_words([words[0], words[1], words[2]]).ok_or("unknown codec")?;
+/// Rules 26 to 29, for a pack whose tree's header was checked.
+pub(crate) fn l3_record(pack: &Pack, record: &L3Record) -> Result<(), String> {
+    let masks = pack.tree()[header::MASKS] as usize;
     if let Some(mask) = record.mask {
         let used = if record.rule == InactiveRule::Sign { 2 } else { 1 };
         if mask as usize + used > masks {
@@ -124,7 +126,7 @@ fn l3_record(pack: &Pack, words: &[u32], masks: usize) -> Result<(), String> {
 }
 
 /// Reads and checks what the tables and the tree's header say of one grid: rules 36 to 39.
-pub(super) fn grid(words: &[u32], index: usize, record: GridRecord, name: &str) -> Result<Grid, PackError> {
+pub(crate) fn grid(words: &[u32], index: usize, record: GridRecord, name: &str) -> Result<Grid, PackError> {
     let at = words[header::GRID_AT] as usize + index * GRID_WORDS;
     let h = &words[at..at + GRID_WORDS];
     let three = |at: usize| [h[at], h[at + 1], h[at + 2]];
@@ -174,11 +176,12 @@ pub(super) fn grid(words: &[u32], index: usize, record: GridRecord, name: &str) 
 }
 
 /// Rules 41 and 42.
-pub(super) fn frames(pack: &Pack) -> Result<(), PackError> {
-    for (grid, frame) in pack.grids.iter().flat_map(|grid| grid.frames.iter().map(move |frame| (grid, frame)))
+pub(crate) fn frames(pack: &Pack) -> Result<(), PackError> {
+    for (grid, frame) in
+        pack.grids().iter().flat_map(|grid| grid.frames.iter().map(move |frame| (grid, frame)))
     {
         let what = |what: &str| format!("grid {:?} frame {} {what}", grid.name, frame.record.number);
-        let are_texels = frame.chunks.iter().all(|&chunk| pack.texels_of(chunk).is_some());
+        let are_texels = frame.chunks.iter().all(|&chunk| pack.is_texels(chunk));
         ensure(are_texels && frame.chunks.is_sorted_by(|a, b| a < b), || {
             what("lists chunks that are not texels, or out of order")
         })?;
@@ -188,10 +191,10 @@ pub(super) fn frames(pack: &Pack) -> Result<(), PackError> {
 }
 
 /// Checks each grid's roots and the L1 nodes that they name: rules 43 to 46.
-pub(super) fn l1_nodes(pack: &Pack) -> Result<(), PackError> {
-    let words = &pack.tree;
+pub(crate) fn l1_nodes(pack: &Pack) -> Result<(), PackError> {
+    let words = pack.tree();
     let mut nodes: Vec<(u32, u32)> = Vec::new();
-    for grid in &pack.grids {
+    for grid in pack.grids() {
         for &root in &words[grid.root_words()] {
             match Link::from_word(root) {
                 Link::Node(0) => {}

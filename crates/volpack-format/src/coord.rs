@@ -1,7 +1,5 @@
 //! Index-space coordinates and boxes.
 
-use serde::{Deserialize, Serialize};
-
 /// Voxels along one axis of a brick.
 pub const BRICK_DIM: i32 = 8;
 /// Voxels along one axis of an L2 node: 16 bricks. Also the grid that origins and boxes snap to, so
@@ -13,8 +11,8 @@ pub const ROOT_DIM: i32 = 4096;
 /// A voxel's integer position in OpenVDB index space.
 ///
 /// Ordered by x, then y, then z, which is the order in which OpenVDB stores nodes and voxels.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
-#[serde(transparent)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize), serde(transparent))]
 pub struct Coord(pub [i32; 3]);
 
 impl Coord {
@@ -61,7 +59,8 @@ impl Coord {
 }
 
 /// An inclusive box of voxels. Empty when any minimum is above its maximum.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
 pub struct CoordBox {
     /// The smallest corner.
     pub min: Coord,

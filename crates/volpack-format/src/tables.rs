@@ -2,15 +2,13 @@
 //!
 //! Numbers of rules are those of `docs/format.md`, "What a reader checks".
 
-use std::ops::Range;
-
 use bytemuck::Zeroable;
 use bytemuck::allocation::pod_collect_to_vec;
 
-use super::PackError;
-use super::error::{corrupt, ensure};
-use super::layout::{ALIGNMENT, Chunk, Header, MAGIC, Section, VERSION, encoding, kind};
-use super::writer::tables_digest;
+use crate::PackError;
+use crate::error::{corrupt, ensure};
+use crate::layout::{ALIGNMENT, Chunk, Header, MAGIC, Section, VERSION, encoding, kind};
+use crate::source::Source;
 
 /// Rule 10: what one chunk may take in memory. Those that volpack writes have at most 256 KiB.
 const MAX_CHUNK: u32 = 16 << 20;
@@ -21,38 +19,47 @@ const MAX_WHOLE: u64 = 256 << 20;
 const MAX_EXPANSION: u64 = 512;
 
 /// Rule 14: keeps a small file from taking all memory.
-pub(super) fn fits_memory(raw_bytes: u64, stored_bytes: u64) -> bool {
+pub(crate) fn fits_memory(raw_bytes: u64, stored_bytes: u64) -> bool {
     raw_bytes <= MAX_WHOLE.max(stored_bytes.saturating_mul(MAX_EXPANSION))
 }
 
-/// A section's chunks, by their places in the table.
-pub(super) fn chunk_range(section: &Section) -> Range<usize> {
-    section.first_chunk as usize..section.first_chunk as usize + section.chunks as usize
+/// BLAKE3 of the tables with the header's digest zero: what [`Header::digest`] has to be.
+pub fn tables_digest(header: &Header, sections: &[Section], chunks: &[Chunk]) -> [u8; 32] {
+    let header = Header { digest: [0; 32], ..*header };
+    let mut hasher = blake3::Hasher::new();
+    hasher.update(bytemuck::bytes_of(&header));
+    hasher.update(bytemuck::cast_slice(sections));
+    hasher.update(bytemuck::cast_slice(chunks));
+    *hasher.finalize().as_bytes()
 }
 
 /// Reads header, sections and chunks and checks that they agree with the file and each other.
-pub(super) fn read_tables(bytes: &[u8]) -> Result<(Vec<Section>, Vec<Chunk>), PackError> {
-    if !bytes.starts_with(&MAGIC) {
+pub(crate) fn read_tables(source: &Source) -> Result<(Vec<Section>, Vec<Chunk>), PackError> {
+    let have = source.len();
+    let first = source.read(0, have.min(size_of::<Header>() as u64))?;
+    if !first.starts_with(&MAGIC) {
         return Err(PackError::NotPack); // Rule 1.
     }
-    let mut header = Header::zeroed();
-    let header_bytes = bytes.get(..size_of::<Header>());
     let cut = || PackError::Corrupt("the file ends inside its tables".to_owned());
-    bytemuck::bytes_of_mut(&mut header).copy_from_slice(header_bytes.ok_or_else(cut)?);
+    let mut header = Header::zeroed();
+    let bytes = bytemuck::bytes_of_mut(&mut header);
+    bytes.copy_from_slice(first.get(..bytes.len()).ok_or_else(cut)?);
     if header.major != VERSION {
         return Err(PackError::Version(header.major)); // Rule 2.
     }
-    let have = bytes.len() as u64;
     if header.file_bytes != have {
         return Err(PackError::Length { have, says: header.file_bytes }); // Rule 3.
     }
-    let sections_end = size_of::<Header>() + header.sections as usize * size_of::<Section>();
-    let tables_end = sections_end as u64 + u64::from(header.chunks) * size_of::<Chunk>() as u64;
+    let sections_bytes = u64::from(header.sections) * size_of::<Section>() as u64;
+    let chunks_bytes = u64::from(header.chunks) * size_of::<Chunk>() as u64;
+    let sections_end = size_of::<Header>() as u64 + sections_bytes;
+    let tables_end = sections_end + chunks_bytes;
     if tables_end > have {
         return Err(cut()); // Rule 4.
     }
-    let sections: Vec<Section> = pod_collect_to_vec(&bytes[size_of::<Header>()..sections_end]);
-    let chunks: Vec<Chunk> = pod_collect_to_vec(&bytes[sections_end..tables_end as usize]);
+    let sections: Vec<Section> =
+        pod_collect_to_vec(&source.read(size_of::<Header>() as u64, sections_bytes)?);
+    let chunks: Vec<Chunk> = pod_collect_to_vec(&source.read(sections_end, chunks_bytes)?);
     if tables_digest(&header, &sections, &chunks) != header.digest {
         return Err(PackError::Digest { what: "the header".to_owned() }); // Rule 5.
     }
@@ -78,7 +85,7 @@ fn check_section(
 ) -> Result<u64, PackError> {
     let name = kind::name(section.kind);
     // Rule 6.
-    let entries = chunks.get(chunk_range(section)).filter(|_| section.first_chunk as usize == next_chunk);
+    let entries = chunks.get(section.chunk_range()).filter(|_| section.first_chunk as usize == next_chunk);
     let Some(entries) = entries else {
         return corrupt(format!("the {name} has chunks outside the chunk table"));
     };

@@ -4,7 +4,7 @@
 //! unorm and `e` is half float, in word 2 of the brick's L3 record. `m` is rounded down and `e` up, so
 //! that a brick's values always lie inside, and `t = 1` is a bound that no voxel of it exceeds.
 
-use half::f16;
+use crate::Half;
 
 /// The range that a whole sequence's values lie in.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -21,12 +21,12 @@ pub struct BrickRange {
     /// The minimum as 65535ths of the span.
     pub min: u16,
     /// The extent as a fraction of the span.
-    pub extent: f16,
+    pub extent: Half,
 }
 
 impl BrickRange {
     /// The whole sequence's range.
-    pub const SEQUENCE: Self = Self { min: 0, extent: f16::ONE };
+    pub const SEQUENCE: Self = Self { min: 0, extent: Half::ONE };
 
     /// Word 2 of an L3 record.
     pub fn to_word(self) -> u32 {
@@ -35,7 +35,7 @@ impl BrickRange {
 
     /// The inverse of [`BrickRange::to_word`].
     pub fn from_word(word: u32) -> Self {
-        Self { min: word as u16, extent: f16::from_bits((word >> 16) as u16) }
+        Self { min: word as u16, extent: Half::from_bits((word >> 16) as u16) }
     }
 }
 
@@ -85,27 +85,17 @@ impl SequenceRange {
         let fraction = |v: f32| (f64::from(v) - f64::from(self.lo)) / f64::from(self.span);
         let mut brick = BrickRange {
             min: (fraction(min) * 65535.0).floor().clamp(0.0, 65535.0) as u16,
-            extent: f16::ZERO,
+            extent: Half::ZERO,
         };
         while brick.min > 0 && self.decode(brick, 0.0) > min {
             brick.min -= 1;
         }
-        brick.extent = f16::from_f64((fraction(max) - f64::from(brick.min) / 65535.0).max(0.0));
+        brick.extent = Half::from_f64((fraction(max) - f64::from(brick.min) / 65535.0).max(0.0));
         while self.decode(brick, 1.0) < max {
             // The next half up; positive halves are ordered as their bits are.
-            brick.extent = f16::from_bits(brick.extent.to_bits() + 1);
+            brick.extent = Half::from_bits(brick.extent.to_bits() + 1);
         }
         brick
-    }
-
-    /// The fractions that some values are of the brick's range, 0 to 1.
-    pub(super) fn normalise<const N: usize>(&self, brick: BrickRange, values: &[f32; N]) -> [f32; N] {
-        let (lo, span) = (f64::from(self.lo), f64::from(self.span));
-        let (min, extent) = (f64::from(brick.min) / 65535.0, brick.extent.to_f64());
-        if extent == 0.0 {
-            return [0.0; N];
-        }
-        values.map(|v| (((f64::from(v) - lo) / span - min) / extent).clamp(0.0, 1.0) as f32)
     }
 }
 

@@ -3,7 +3,7 @@
 //! This file has the words' places and meaning; `docs/format.md`, "The tree", is the specification.
 
 use crate::codec::Codec;
-use crate::volume::{Constant, InactiveRule};
+use crate::{Constant, InactiveRule};
 
 /// Words of the tree's header.
 pub const HEADER_WORDS: usize = 32;
@@ -151,6 +151,9 @@ pub fn ranks(mask: &[u32]) -> Vec<u32> {
 }
 
 /// How many bits of `mask` are on before bit `index`, by way of the ranks; `None` if it is off.
+///
+/// # Panics
+/// When the mask has no such bit, or not as many ranks as [`ranks`] gives.
 pub fn rank(mask: &[u32], ranks: &[u32], index: usize) -> Option<u32> {
     let (word, bit) = (index / 32, index % 32);
     let bits = mask[word];

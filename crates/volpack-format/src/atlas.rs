@@ -51,6 +51,9 @@ impl Atlas {
     }
 
     /// Copies one brick's bytes out of a slab.
+    ///
+    /// # Panics
+    /// When the slab is too short to have that place.
     pub fn extract(&self, slab: &[u8], place: u32) -> Vec<u8> {
         let layout = self.codec.layout();
         let mut brick = Vec::with_capacity(layout.brick_bytes());
