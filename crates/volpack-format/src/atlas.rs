@@ -29,6 +29,11 @@ pub struct Atlas {
 }
 
 impl Atlas {
+    /// The one of a codec.
+    pub fn of(atlases: &[Self], codec: Codec) -> Option<&Self> {
+        atlases.iter().find(|atlas| atlas.codec == codec)
+    }
+
     /// Bricks in a full slab.
     pub fn slab_bricks(&self) -> u32 {
         self.columns * self.rows

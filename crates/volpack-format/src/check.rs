@@ -11,7 +11,7 @@ use crate::tree::{
     self, GRID_WORDS, HEADER_WORDS, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS, grid, header,
     l1_words,
 };
-use crate::{CELL_DIM, Coord, Grid, InactiveRule, Pack, PackError};
+use crate::{Atlas, CELL_DIM, Coord, Grid, InactiveRule, PackError};
 
 /// So many entries of a table from the first on.
 pub(crate) fn range(first: u32, count: u32) -> Range<usize> {
@@ -57,8 +57,7 @@ fn area(words: &[u32], at: usize, count: usize, size: usize, what: &str) -> Resu
 }
 
 /// Checks the tree's header, L3 records and L2 nodes: rules 22, 23 and 25 to 31.
-pub(crate) fn tree(pack: &Pack) -> Result<(), PackError> {
-    let words = pack.tree();
+pub(crate) fn tree(words: &[u32], atlases: &[Atlas]) -> Result<(), PackError> {
     if words.len() < HEADER_WORDS || words[header::WORDS] as usize != words.len() {
         return corrupt("the tree is not as long as it says");
     }
@@ -69,7 +68,7 @@ pub(crate) fn tree(pack: &Pack) -> Result<(), PackError> {
     area(words, header::MASK_AT, count(header::MASKS), MASK_WORDS, "masks")?;
     area(words, header::CONSTANT_AT, count(header::CONSTANTS), 1, "constants")?;
     for codec in Codec::WITH_TEXELS {
-        let atlas = pack.atlas(codec).map_or([0; 3], |a| [a.columns, a.rows, a.page_slabs]);
+        let atlas = Atlas::of(atlases, codec).map_or([0; 3], |a| [a.columns, a.rows, a.page_slabs]);
         ensure(words[header::atlas(codec)..][..3] == atlas, || {
             format!("the tree and the atlas table disagree about {}", codec.name())
         })?;
@@ -78,7 +77,7 @@ pub(crate) fn tree(pack: &Pack) -> Result<(), PackError> {
         let record = L3Record::from_words([record[0], record[1], record[2]]);
         record
             .ok_or("unknown codec".to_owned())
-            .and_then(|record| l3_record(pack, &record))
+            .and_then(|record| l3_record(words, atlases, &record))
             .map_err(|what| PackError::Corrupt(format!("L3 record {i}: {what}")))?;
     }
     for (i, node) in words[nodes].chunks_exact(NODE_WORDS).enumerate() {
@@ -96,9 +95,9 @@ fn ones(mask: &[u32]) -> usize {
     mask.iter().map(|word| word.count_ones() as usize).sum()
 }
 
-/// Rules 26 to 29, for a pack whose tree's header was checked.
-pub(crate) fn l3_record(pack: &Pack, record: &L3Record) -> Result<(), String> {
-    let masks = pack.tree()[header::MASKS] as usize;
+/// Rules 26 to 29, for a tree whose header was checked.
+pub(crate) fn l3_record(words: &[u32], atlases: &[Atlas], record: &L3Record) -> Result<(), String> {
+    let masks = words[header::MASKS] as usize;
     if let Some(mask) = record.mask {
         let used = if record.rule == InactiveRule::Sign { 2 } else { 1 };
         if mask as usize + used > masks {
@@ -110,7 +109,7 @@ pub(crate) fn l3_record(pack: &Pack, record: &L3Record) -> Result<(), String> {
     if record.codec == Codec::Constant {
         return Ok(());
     }
-    let atlas = pack.atlas(record.codec).ok_or("its codec has no atlas")?;
+    let atlas = Atlas::of(atlases, record.codec).ok_or("its codec has no atlas")?;
     if record.slot >= atlas.bricks {
         return Err(format!("brick {} of {}", record.slot, atlas.bricks));
     }
@@ -175,13 +174,11 @@ pub(crate) fn grid(words: &[u32], index: usize, record: GridRecord, name: &str) 
     Ok(grid)
 }
 
-/// Rules 41 and 42.
-pub(crate) fn frames(pack: &Pack) -> Result<(), PackError> {
-    for (grid, frame) in
-        pack.grids().iter().flat_map(|grid| grid.frames.iter().map(move |frame| (grid, frame)))
-    {
+/// Rules 41 and 42. `is_texels` says whether a chunk is one of texels.
+pub(crate) fn frames(grids: &[Grid], is_texels: impl Fn(u32) -> bool) -> Result<(), PackError> {
+    for (grid, frame) in grids.iter().flat_map(|grid| grid.frames.iter().map(move |frame| (grid, frame))) {
         let what = |what: &str| format!("grid {:?} frame {} {what}", grid.name, frame.record.number);
-        let are_texels = frame.chunks.iter().all(|&chunk| pack.is_texels(chunk));
+        let are_texels = frame.chunks.iter().all(|&chunk| is_texels(chunk));
         ensure(are_texels && frame.chunks.is_sorted_by(|a, b| a < b), || {
             what("lists chunks that are not texels, or out of order")
         })?;
@@ -191,10 +188,9 @@ pub(crate) fn frames(pack: &Pack) -> Result<(), PackError> {
 }
 
 /// Checks each grid's roots and the L1 nodes that they name: rules 43 to 46.
-pub(crate) fn l1_nodes(pack: &Pack) -> Result<(), PackError> {
-    let words = pack.tree();
+pub(crate) fn l1_nodes(words: &[u32], grids: &[Grid]) -> Result<(), PackError> {
     let mut nodes: Vec<(u32, u32)> = Vec::new();
-    for grid in pack.grids() {
+    for grid in grids {
         for &root in &words[grid.root_words()] {
             match Link::from_word(root) {
                 Link::Node(0) => {}

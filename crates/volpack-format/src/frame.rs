@@ -294,7 +294,7 @@ impl FrameReader<'_> {
 
     /// Those of the tree were checked when the pack was opened; a caller may have made one up, or mixed up two packs.
     fn check(&self, record: &L3Record) -> Result<(), PackError> {
-        check::l3_record(self.pack, record)
+        check::l3_record(self.pack.tree(), self.pack.atlases(), record)
             .map_err(|what| PackError::Corrupt(format!("an L3 record: {what}")))
     }
 

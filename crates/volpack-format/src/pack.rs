@@ -118,10 +118,10 @@ impl Pack {
         pack.check_sections()?;
         pack.read_atlases()?;
         pack.tree = pack.records(kind::TREE)?;
-        check::tree(&pack)?;
+        check::tree(&pack.tree, &pack.atlases)?;
         pack.grids = pack.read_grids()?;
-        check::frames(&pack)?;
-        check::l1_nodes(&pack)?;
+        check::frames(&pack.grids, |chunk| pack.is_texels(chunk))?;
+        check::l1_nodes(&pack.tree, &pack.grids)?;
         Ok(pack)
     }
 
@@ -317,7 +317,7 @@ impl Pack {
 
     /// The atlas of a codec.
     pub fn atlas(&self, codec: Codec) -> Option<&Atlas> {
-        self.atlases.iter().find(|a| a.codec == codec)
+        Atlas::of(&self.atlases, codec)
     }
 
     /// Checks one chunk's digest and decodes it, by its place in the chunk table. Many may be checked at the same time.
