@@ -149,7 +149,7 @@ fn max_error(bound: &str) -> Quality {
 
 /// How many bytes an error says are the least.
 fn least(error: &Error) -> u64 {
-    assert_eq!(exit_code::of(&error), 2, "{error}");
+    assert_eq!(exit_code::of(error), 2, "{error}");
     let text = error.to_string();
     let number =
         text.split_once("the least is ").and_then(|(_, rest)| rest.split(':').next()).unwrap_or_default();
@@ -235,7 +235,7 @@ fn the_floor_that_nobody_named_helps_the_worst_frame() {
 /// found without the verifier.
 fn largest_errors(case: &Case, pack: &Pack) -> Vec<f64> {
     let of_grid = |g: usize| {
-        let (grid, provenance) = (&pack.grids()[g], Provenance::of(&pack).unwrap());
+        let (grid, provenance) = (&pack.grids()[g], Provenance::of(pack).unwrap());
         let (mut worst, mut min, mut max) = (0.0f64, f64::INFINITY, f64::NEG_INFINITY);
         let mut active = |value: f32| (min, max) = (min.min(value.into()), max.max(value.into()));
         for (f, frame) in grid.frames.iter().enumerate() {

@@ -72,7 +72,7 @@ pub enum Integers {
 /// The zstd level of a pack where none is chosen: the level of zstd's own tool.
 pub const DEFAULT_ZSTD: i32 = 3;
 
-/// Everything that a pack's bytes depend on beside its sources. Its JSON is a flat object: [`Document`].
+/// Everything that a pack's bytes depend on beside its sources. Its JSON is a flat object.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(into = "Document", try_from = "Document")]
 pub struct Settings {

@@ -51,7 +51,7 @@ pub(super) struct TexelReference {
     pub active_error_l2: f64,
 }
 
-/// A [`TexelReference`] by its referenced brick's place among the referenced bricks that were compared, and its range as a record has it.
+/// What a brick would be with the texels of another: that one by its place among those that were compared, and its range as a record has it.
 #[derive(Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
 pub struct Offer {

@@ -282,8 +282,9 @@ impl EncoderCache {
                 }
             }
         }
-        let earlier = self.earlier.as_mut().expect("there is one");
-        earlier.load(&mut self.memo, tree, &self.batches, &wanted)?;
+        if let Some(earlier) = &mut self.earlier {
+            earlier.load(&mut self.memo, tree, &self.batches, &wanted)?;
+        }
         self.memo.flush()
     }
 
@@ -384,9 +385,8 @@ impl EncoderCache {
                 made?.iter().zip(kinds).try_for_each(|(made, kind)| self.memo.add(*kind, ids, made))?;
             }
             self.memo.flush()?;
-            if self.earlier.is_some() {
-                let batches = self.batches_of(&missing);
-                let earlier = self.earlier.as_mut().expect("there is one");
+            let batches = self.batches_of(&missing);
+            if let Some(earlier) = &mut self.earlier {
                 kinds.iter().for_each(|&kind| earlier.note_made(&batches, kind));
             }
             if self.saved.elapsed() > SAVE_EVERY {
