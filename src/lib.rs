@@ -21,17 +21,25 @@
 //! - [`sweep`] measures many settings side by side, and how steady each is.
 //! - [`cli`] is the command line; [`progress`] and [`cancel`] are how long work and its caller speak.
 //!
-//! To build a pack:
+//! To build a pack, and to read a voxel of it:
 //!
-//! ```no_run
+//! ```
+//! use volpack::pack::Pack;
 //! use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 //! use volpack::settings::{Format, Settings};
+//! use volpack::volume::Coord;
 //!
+//! let folder = tempfile::tempdir()?;
+//! let path = folder.path().join("fog.volpack");
 //! let settings = Settings { encoding: Format::Bc7.into(), ..Settings::default() };
-//! let job = Job::new(vec!["smoke.vdb".into()], "smoke.volpack".into(), settings, VerifyLevel::All);
+//! let job = Job::new(vec!["fixtures/fog_half_blosc.vdb".into()], path.clone(), settings, VerifyLevel::Voxels);
 //! let outcome = build(&job, &mut Silent)?;
 //! assert!(outcome.verification.is_some_and(|report| report.ok));
-//! # Ok::<(), volpack::error::Error>(())
+//!
+//! let pack = Pack::open(&path)?;
+//! let (region, _side) = pack.frame(0, 0)?.locate(Coord::new(0, 0, 0));
+//! println!("{}: {region:?}", pack.grids()[0].name);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
 pub mod atomic_file;
