@@ -13,7 +13,9 @@ mod plain;
 use rayon::prelude::*;
 
 pub use volpack_format::Half;
-pub use volpack_format::codec::{BrickLayout, BrickRange, Codec, SequenceRange, decode, spread};
+pub use volpack_format::codec::{
+    BrickLayout, BrickRange, Codec, Fidelity, SequenceRange, TextureFormat, decode, spread,
+};
 
 use crate::volume::{BRICK_VOXELS, Brick, Mask512};
 

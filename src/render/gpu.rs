@@ -12,7 +12,7 @@ use self::params::Params;
 use self::pipelines::{Has, Pipelines, WORKGROUP};
 use super::cpu::{Scene, TraceError};
 use super::image::Image;
-use crate::codec::Codec;
+use crate::codec::{Codec, TextureFormat};
 use crate::pack::{Atlas, Pack, PackError};
 use crate::volume::CoordBox;
 
@@ -358,12 +358,12 @@ impl Queries {
 }
 
 fn texture_format(codec: Codec) -> wgpu::TextureFormat {
-    match codec {
-        Codec::Bc7 => wgpu::TextureFormat::Bc7RgbaUnorm,
-        Codec::Bc4 => wgpu::TextureFormat::Bc4RUnorm,
-        Codec::F16 => wgpu::TextureFormat::R16Float,
-        Codec::F32 => wgpu::TextureFormat::R32Float,
-        Codec::Unorm8 | Codec::Constant => wgpu::TextureFormat::R8Unorm,
+    match codec.texture() {
+        TextureFormat::Bc7RgbaUnorm => wgpu::TextureFormat::Bc7RgbaUnorm,
+        TextureFormat::Bc4RUnorm => wgpu::TextureFormat::Bc4RUnorm,
+        TextureFormat::R8Unorm => wgpu::TextureFormat::R8Unorm,
+        TextureFormat::R16Float => wgpu::TextureFormat::R16Float,
+        TextureFormat::R32Float => wgpu::TextureFormat::R32Float,
     }
 }
 

@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use super::Reading;
 use super::promise::Promise;
-use crate::codec::{BrickRange, Codec};
+use crate::codec::{BrickRange, Codec, Fidelity};
 use crate::pack::{FrameReader, Region};
 use crate::settings::Masks;
 use crate::vdb::{Accessor, GridInfo, Internal, Scalar, Tree};
@@ -287,12 +287,13 @@ impl<T: Scalar> Comparison<'_, T> {
                     ValueRange::union_all(texel_mask.map(|i| ValueRange::of(self.reading.value(source[i]))));
                 Bound::Within(range.map_or(0.0, ValueRange::width))
             }
-            Codec::Constant | Codec::F32 => Bound::Exact,
-            Codec::F16 => Bound::Half,
-            // Half a step of 255.
-            Codec::Unorm8 => Bound::Within(extent / 510.0 + slack),
-            // Blocks promise no more than to stay inside the brick's range.
-            Codec::Bc4 | Codec::Bc7 => Bound::Within(extent + slack),
+            codec => match codec.fidelity() {
+                Fidelity::Exact => Bound::Exact,
+                Fidelity::NearestHalf => Bound::Half,
+                // Half a step of 255.
+                Fidelity::NearestStep => Bound::Within(extent / 510.0 + slack),
+                Fidelity::InRange => Bound::Within(extent + slack),
+            },
         };
         Contract { keeps_mask: record.mask.is_some(), exact_inactive, codec: Some(record.codec), values }
     }

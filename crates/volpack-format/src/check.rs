@@ -113,8 +113,7 @@ pub(crate) fn l3_record(words: &[u32], atlases: &[Atlas], record: &L3Record) -> 
     if record.slot >= atlas.bricks {
         return Err(format!("brick {} of {}", record.slot, atlas.bricks));
     }
-    let axes = if record.codec == Codec::Bc7 { 0..=2 } else { 2..=2 };
-    if !axes.contains(&record.axis) {
+    if !record.codec.axes().contains(&record.axis) {
         return Err(format!("packing axis {}", record.axis));
     }
     let extent = BrickRange::from_word(record.word2).extent;

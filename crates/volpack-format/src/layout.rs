@@ -138,12 +138,12 @@ pub mod encoding {
     /// How a section is stored in a pack that uses zstd, or does not.
     pub fn of(kind: u32, codec: u32, zstd: bool) -> u32 {
         use crate::codec::Codec;
-        match (kind, Codec::from_tag(codec)) {
+        match (kind, Codec::from_tag(codec).map(Codec::word_bytes)) {
             _ if !zstd => RAW,
             // So short that they stay readable in a hex dump.
             (super::kind::GRIDS | super::kind::NAMES | super::kind::ATLASES, _) => RAW,
-            (super::kind::TEXELS, Some(Codec::F16)) => ZSTD_SHUFFLE_2,
-            (super::kind::TEXELS, Some(Codec::F32)) => ZSTD_SHUFFLE_4,
+            (super::kind::TEXELS, Some(2)) => ZSTD_SHUFFLE_2,
+            (super::kind::TEXELS, Some(4)) => ZSTD_SHUFFLE_4,
             _ => ZSTD,
         }
     }

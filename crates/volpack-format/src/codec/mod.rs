@@ -8,10 +8,15 @@ mod bc4;
 mod bc7;
 mod plain;
 mod range;
+mod table;
 
 pub use range::{BrickRange, SequenceRange};
+pub use table::{Fidelity, TextureFormat};
 
-use crate::{BRICK_VOXELS, Half};
+use std::ops::RangeInclusive;
+
+use crate::BRICK_VOXELS;
+use table::{Row, TABLE};
 
 /// For each packing axis of bc7, how far apart in a brick two voxels are that are neighbours along it, down a slice (`v`)
 /// and across it (`u`): those two are the other axes in ascending order.
@@ -49,33 +54,43 @@ impl Codec {
         [Self::Constant].into_iter().chain(Self::WITH_TEXELS).find(|c| *c as u32 == tag)
     }
 
+    fn row(self) -> &'static Row {
+        &TABLE[self as usize]
+    }
+
     /// Its name in manifests and reports.
     pub fn name(self) -> &'static str {
-        match self {
-            Self::Constant => "constant",
-            Self::Bc7 => "bc7",
-            Self::Bc4 => "bc4",
-            Self::Unorm8 => "unorm8",
-            Self::F16 => "f16",
-            Self::F32 => "f32",
-        }
+        self.row().name
     }
 
     /// Whether texels are fractions of the brick's range rather than values.
     pub fn is_normalised(self) -> bool {
-        matches!(self, Self::Bc7 | Self::Bc4 | Self::Unorm8)
+        self.row().is_normalised
+    }
+
+    /// The packing axes that a brick's record may name: 0, 1 and 2 for x, y and z, or 2 alone where channels run along none.
+    pub fn axes(self) -> RangeInclusive<u8> {
+        if self.row().has_axis { 0..=2 } else { 2..=2 }
+    }
+
+    /// Bytes of the words whose bytes are gathered before zstd; 1 for none.
+    pub fn word_bytes(self) -> usize {
+        self.row().word_bytes
+    }
+
+    /// The texture that holds its bricks.
+    pub fn texture(self) -> TextureFormat {
+        self.row().texture
+    }
+
+    /// What it promises of every voxel that its texels give.
+    pub fn fidelity(self) -> Fidelity {
+        self.row().fidelity
     }
 
     /// How one brick lies in a texture.
     pub fn layout(self) -> BrickLayout {
-        let (slices, block_dim, block_bytes) = match self {
-            Self::Constant => (0, 1, 0),
-            Self::Bc7 => (2, 4, 16),
-            Self::Bc4 => (8, 4, 8),
-            Self::Unorm8 => (8, 1, 1),
-            Self::F16 => (8, 1, 2),
-            Self::F32 => (8, 1, 4),
-        };
+        let Row { slices, block_dim, block_bytes, .. } = *self.row();
         BrickLayout { slices, rows: 8 / block_dim, row_bytes: 8 / block_dim * block_bytes }
     }
 }
@@ -126,14 +141,7 @@ pub fn decode(
 /// When `bytes` is not [`BrickLayout::brick_bytes`] long, or `axis` is above 2 for bc7.
 pub fn decode_texels(codec: Codec, bytes: &[u8], axis: u8, out: &mut [f32; BRICK_VOXELS]) {
     assert_eq!(bytes.len(), codec.layout().brick_bytes(), "bytes of a brick in {}", codec.name());
-    match codec {
-        Codec::Constant => {}
-        Codec::Bc7 => bc7::decode(bytes, axis, out),
-        Codec::Bc4 => bc4::decode(bytes, out),
-        Codec::Unorm8 => plain::decode(bytes, |[byte]| f32::from(byte) / 255.0, out),
-        Codec::F16 => plain::decode(bytes, |half| Half::from_bits(u16::from_le_bytes(half)).to_f32(), out),
-        Codec::F32 => plain::decode(bytes, f32::from_le_bytes, out),
-    }
+    (codec.row().decode)(bytes, axis, out);
 }
 
 /// How far a GPU's arithmetic may be from [`decode`]'s, of the largest number in it, `lo + span · (m/65535 + e · t)`: four
@@ -148,8 +156,8 @@ pub fn spread(
     range: BrickRange,
 ) -> Box<[f32; BRICK_VOXELS]> {
     let mut out = Box::new([0.0; BRICK_VOXELS]);
-    if codec == Codec::Bc4 {
-        bc4::spread(bytes, &mut out);
+    if let Some(spread) = codec.row().spread {
+        spread(bytes, &mut out);
         let extent = sequence.span * range.extent.to_f32();
         out.iter_mut().for_each(|s| *s *= extent);
     }
