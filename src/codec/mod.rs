@@ -1,8 +1,7 @@
-//! Encodes bricks: the only room that knows how values become texels. [`volpack_format::codec`] decodes them.
+//! Encodes bricks; nothing else knows how values become texels. [`volpack_format::codec`] decodes them.
 //!
-//! A codec turns a brick's 512 values into a fixed number of bytes that lie as a GPU texture's texels
-//! or blocks do, and back into exactly the values that the texture unit gives. Bytes of one brick
-//! are ordered slice by slice, row by row (`z`, then `y`, then `x` of the texture).
+//! A codec turns a brick's 512 values into a fixed number of bytes that lie as a GPU texture's texels or blocks do: slice
+//! by slice, row by row (`z`, then `y`, then `x` of the texture).
 
 mod bc4;
 mod bc7;

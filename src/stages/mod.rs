@@ -1,4 +1,4 @@
-//! The eight stages, one room each. A stage knows only its neighbours' types:
+//! The eight stages, one module each. A stage knows only its neighbours' types:
 //!
 //! | | stage | gives |
 //! |---|---|---|

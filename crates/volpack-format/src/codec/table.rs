@@ -1,4 +1,7 @@
 //! All that a reader knows of each codec. A new one is a file beside this one, a name in [`Codec`] and a row here.
+//!
+//! Format 1 is full: its tree header has no words for a sixth atlas and its grid table no error for it, so a new codec
+//! needs format 2.
 
 use super::{Codec, bc4, bc7, plain};
 use crate::{BRICK_VOXELS, Half};
