@@ -38,7 +38,7 @@ pub struct VerifyArgs {
 
 #[derive(Clone, Copy, PartialEq, ValueEnum)]
 enum Level {
-    /// Digests, offsets, indices and counts; needs no source
+    /// Hashes, offsets, indices and counts; needs no source
     Structure,
     /// The structure, and every voxel against the source
     Voxels,

@@ -1,7 +1,7 @@
 //! Stage 5 over the grids of a pack.
 
 use super::Progress;
-use super::cached_bricks::CachedOffers;
+use super::cached_bricks::{self, CachedOffers, GridCache};
 use crate::cancel::CancelToken;
 use crate::error::{Error, Result};
 use crate::settings::{Encoding, Integers, Quality, Settings, whole_range};
@@ -14,43 +14,68 @@ use crate::vdb::GridClass;
 use crate::verify;
 use crate::volume::ValueRange;
 
-/// What makes the texels of every grid. Nothing is made yet.
-///
-/// # Errors
-/// A grid whose values no float or no range holds.
-pub(super) fn encoders(
-    facts: &[GridFacts],
-    trees: &[SequenceTree],
-    settings: &Settings,
-    cancel: &CancelToken,
-) -> Result<Vec<EncoderCache>> {
-    let one = |(facts, tree): (&GridFacts, &SequenceTree)| {
-        check_integers(facts, tree, settings)?;
-        EncoderCache::new(tree, terms(facts, tree, settings), cancel.clone()).ok_or_else(|| {
+/// A grid that is being built.
+pub(super) struct GridBuild {
+    /// What is known of it before a voxel is read.
+    pub facts: GridFacts,
+    /// Its nodes and bricks.
+    pub tree: SequenceTree,
+    /// What makes their texels.
+    pub encoders: EncoderCache,
+    /// What earlier builds found of bricks that suit each other, with a cache.
+    offers: Option<CachedOffers>,
+}
+
+impl GridBuild {
+    /// A grid of which no texel is made yet, with the cache around its encoders.
+    ///
+    /// # Errors
+    /// A grid whose values no float or no range holds.
+    pub fn new(
+        facts: GridFacts,
+        tree: SequenceTree,
+        cache: Option<GridCache>,
+        settings: &Settings,
+        cancel: &CancelToken,
+    ) -> Result<Self> {
+        check_integers(&facts, &tree, settings)?;
+        let encoders = EncoderCache::new(&tree, terms(&facts, &tree, settings), cancel.clone());
+        let mut encoders = encoders.ok_or_else(|| {
             Error::Input(format!(
                 "grid {:?}: its values span more than an f32 can hold: scale the grid down before the export",
                 facts.name
             ))
-        })
-    };
-    facts.iter().zip(trees).map(one).collect()
+        })?;
+        let offers = cache.map(|cache| cached_bricks::wrap(&mut encoders, cache));
+        Ok(Self { facts, tree, encoders, offers })
+    }
+
+    /// Keeps what was made of its bricks.
+    ///
+    /// # Errors
+    /// When a scratch file cannot be read back.
+    pub fn save(&mut self) -> Result<()> {
+        Ok(self.encoders.save(&self.tree)?)
+    }
+}
+
+/// Bytes of the trees and masks of all grids.
+fn all_tree_bytes(grids: &[GridBuild]) -> Result<u64> {
+    tree_bytes(grids.iter().map(|grid| (&grid.facts, &grid.tree)))
 }
 
 /// Decides how the bricks of every grid are coded.
 pub(super) fn allocate(
-    facts: &[GridFacts],
-    trees: &mut [SequenceTree],
-    encoders: &mut [EncoderCache],
-    offers: &[Option<CachedOffers>],
+    grids: &mut [GridBuild],
     settings: &Settings,
     progress: &mut dyn Progress,
 ) -> Result<Vec<Allocation>> {
     let Encoding::Uniform { codec, clustering } = &settings.encoding else {
-        return adaptive(facts, trees, encoders, offers, settings, progress);
+        return adaptive(grids, settings, progress);
     };
     let codec = codec.codec();
     let mut allocations = Vec::new();
-    for ((facts, tree), encoders) in facts.iter().zip(trees).zip(encoders) {
+    for GridBuild { facts, tree, encoders, .. } in grids {
         allocations.push(match clustering {
             None => allocate::uniform(tree, encoders, codec),
             Some(clustering) => {
@@ -63,27 +88,24 @@ pub(super) fn allocate(
 }
 
 fn adaptive(
-    facts: &[GridFacts],
-    trees: &mut [SequenceTree],
-    encoders: &mut [EncoderCache],
-    offers: &[Option<CachedOffers>],
+    grids: &mut [GridBuild],
     settings: &Settings,
     progress: &mut dyn Progress,
 ) -> Result<Vec<Allocation>> {
     let size = match settings.quality() {
         Quality::Size(bytes) => Some(bytes),
-        Quality::BitsPerVoxel(bits) => Some((bits * 64.0 * leaves(trees) as f64) as u64),
+        Quality::BitsPerVoxel(bits) => Some((bits * 64.0 * leaves(grids) as f64) as u64),
         _ => None,
     };
     let target = Target {
         size,
         min_frame_psnr: settings.min_frame_psnr(),
-        fixed_bytes: if size.is_some() { tree_bytes(facts.iter().zip(&*trees))? } else { 0 },
+        fixed_bytes: if size.is_some() { all_tree_bytes(grids)? } else { 0 },
     };
-    let bricks: u64 = trees.iter().map(|tree| u64::from(tree.pool.len())).sum();
+    let bricks: u64 = grids.iter().map(|grid| u64::from(grid.tree.pool.len())).sum();
     progress.stage("allocate", bricks, "bricks");
-    let mut grids = Vec::new();
-    for (((facts, tree), encoders), offers) in facts.iter().zip(trees).zip(encoders).zip(offers) {
+    let mut asked = Vec::new();
+    for GridBuild { facts, tree, encoders, offers } in grids {
         let (quality, voxel_size, peak) =
             (quality(facts, tree, settings), facts.smallest_voxel(), peak(tree));
         if let Quality::MaxError(bound) = quality
@@ -96,10 +118,10 @@ fn adaptive(
             )));
         }
         let earlier = offers.as_ref().map(|offers| offers as &dyn EarlierOffers);
-        grids.push(AdaptiveGrid { tree, encoders, earlier, quality, peak, voxel_size });
+        asked.push(AdaptiveGrid { tree, encoders, earlier, quality, peak, voxel_size });
     }
     let cancel = progress.cancel_token();
-    allocate::adaptive(grids, &target, &cancel, &mut |bricks| progress.advance(bricks))
+    allocate::adaptive(asked, &target, &cancel, &mut |bricks| progress.advance(bricks))
 }
 
 /// A level set whose distances keep a bound keeps its signs where the surface is further than this part of it: its surface
@@ -153,23 +175,18 @@ fn quality(facts: &GridFacts, tree: &SequenceTree, settings: &Settings) -> Quali
 }
 
 /// Leaves of the source over all frames.
-fn leaves(trees: &[SequenceTree]) -> u64 {
-    trees.iter().flat_map(|tree| &tree.frames).map(|frame| frame.stats.leaves).sum()
+fn leaves(grids: &[GridBuild]) -> u64 {
+    grids.iter().flat_map(|grid| &grid.tree.frames).map(|frame| frame.stats.leaves).sum()
 }
 
 /// A size that the coarsest choice does not meet is an error that names the least.
-pub(super) fn check_size(
-    facts: &[GridFacts],
-    trees: &[SequenceTree],
-    texel_bytes: u64,
-    settings: &Settings,
-) -> Result<()> {
+pub(super) fn check_size(grids: &[GridBuild], texel_bytes: u64, settings: &Settings) -> Result<()> {
     if !settings.is_adaptive() || !settings.quality().is_size() {
         return Ok(());
     }
-    let leaves = leaves(trees);
+    let leaves = leaves(grids);
     let bits_of = |bytes: u64| if leaves == 0 { 0.0 } else { bytes as f64 / (64.0 * leaves as f64) };
-    let bytes = tree_bytes(facts.iter().zip(trees))? + texel_bytes;
+    let bytes = all_tree_bytes(grids)? + texel_bytes;
     match settings.quality() {
         Quality::Size(asked) if bytes > asked => Err(Error::Usage(format!(
             "size: {asked} bytes on the GPU cannot be reached, the least is {bytes}: raise it, or pack fewer frames"

@@ -23,15 +23,14 @@ pub use crate::report::model::Made;
 use crate::report::model::{BuildReport, StageSeconds};
 use crate::settings::{Format, Settings};
 use crate::stages::allocate::Allocation;
-use crate::stages::dedup::SequenceTree;
-use crate::stages::encoder_cache::EncoderCache;
 use crate::stages::metadata::{self, Digests, KnownDigests, SequenceInfo};
 use crate::stages::quantise::{GridBricks, quantise};
 use crate::stages::relayout::place;
-use crate::stages::select::{GridFacts, Selection, select};
+use crate::stages::select::{Selection, select};
 use crate::stages::serialise::{GridParts, Serialiser, compress_slab};
 use crate::verify::{self, PictureSettings, Sources, VerifyReport};
 use crate::volume::ScratchFolder;
+use allocation::GridBuild;
 pub use explain::{Explanation, StagePlan, explain};
 use frames::Alter;
 use reuse::{Reuse, Reused};
@@ -41,7 +40,7 @@ use reuse::{Reuse, Reused};
 pub enum VerifyLevel {
     /// Not at all
     None,
-    /// Digests, offsets, indices and counts
+    /// Hashes, offsets, indices and counts
     Structure,
     /// Those, and every voxel against the source
     Voxels,
@@ -275,47 +274,41 @@ fn run_stages(
     progress: &mut dyn Progress,
 ) -> Result<FinishedPack> {
     let (Plan { sequence, selection, provenance }, settings) = (plan, &job.settings);
-    let facts: Vec<_> = selection.grids.iter().map(|grid| grid.facts(sequence, settings.fps)).collect();
     progress.stage("flatten", sequence.frames.len() as u64, "frames");
-    let mut trees = frames::read(job, plan, cache, alter, progress)?;
+    let trees = frames::read(job, plan, cache, alter, progress)?;
     clock.lap("flatten and dedup");
     // On a thread of the pool, since what follows goes to the pool some hundred times: from outside each time means to be
     // put to sleep and woken.
     rayon::scope(|_| {
         let cancel = progress.cancel_token();
-        let mut encoders = allocation::encoders(&facts, &trees, settings, &cancel)?;
         let caches = frames::caches(sequence, selection, settings, cache);
-        let wrap = |(encoders, cache): (&mut EncoderCache, Option<_>)| {
-            cache.map(|cache| cached_bricks::wrap(encoders, cache))
-        };
-        let offers: Vec<_> = encoders.iter_mut().zip(caches).map(wrap).collect();
+        let mut grids: Vec<GridBuild> = Vec::new();
+        for ((grid, tree), cache) in selection.grids.iter().zip(trees).zip(caches) {
+            let facts = grid.facts(sequence, settings.fps);
+            grids.push(GridBuild::new(facts, tree, cache, settings, &cancel)?);
+        }
 
-        let allocations =
-            allocation::allocate(&facts, &mut trees, &mut encoders, &offers, settings, progress)?;
-        for (tree, allocation) in trees.iter_mut().zip(&allocations) {
+        let allocations = allocation::allocate(&mut grids, settings, progress)?;
+        for (grid, allocation) in grids.iter_mut().zip(&allocations) {
             if allocation.has_empty_bricks() {
-                tree.prune(|id| allocation.is_empty_brick(id))?;
+                grid.tree.prune(|id| allocation.is_empty_brick(id))?;
             }
         }
         let placement = place(&allocations.iter().collect::<Vec<_>>());
-        allocation::check_size(&facts, &trees, placement.bytes(), settings)?;
+        allocation::check_size(&grids, placement.bytes(), settings)?;
         // Written while slabs are encoded.
-        save(&mut encoders, &trees)?;
+        grids.iter_mut().try_for_each(GridBuild::save)?;
         clock.lap("allocate");
 
-        progress.stage("encode", trees.iter().map(|tree| u64::from(tree.pool.len())).sum(), "bricks");
+        progress.stage("encode", grids.iter().map(|grid| u64::from(grid.tree.pool.len())).sum(), "bricks");
         let level = (settings.zstd != 0).then_some(settings.zstd);
-        let parts = parts(&facts, &trees, &allocations);
+        let parts = parts(&grids, &allocations);
         let mut serialiser = Serialiser::begin(&job.output, &parts, &placement, provenance, level)?;
-        let bricks = facts.iter().zip(&mut trees).zip(&allocations).zip(&mut encoders);
-        let mut bricks: Vec<GridBricks> = bricks
-            .map(|(((facts, tree), allocation), encoders)| GridBricks {
-                name: &facts.name,
-                tree,
-                allocation,
-                encoders,
-            })
-            .collect();
+        let bricks = |(grid, allocation): (_, _)| {
+            let GridBuild { facts, tree, encoders, .. }: &mut GridBuild = grid;
+            GridBricks { name: &facts.name, tree, allocation, encoders }
+        };
+        let mut bricks: Vec<GridBricks> = grids.iter_mut().zip(&allocations).map(bricks).collect();
         let encoded = quantise(
             &placement,
             &mut bricks,
@@ -327,24 +320,15 @@ fn run_stages(
                 Ok(())
             },
         )?;
-        let finished = serialiser.finish(&self::parts(&facts, &trees, &allocations), &placement, &encoded)?;
-        save(&mut encoders, &trees)?;
+        let finished = serialiser.finish(&self::parts(&grids, &allocations), &placement, &encoded)?;
+        grids.iter_mut().try_for_each(GridBuild::save)?;
         Ok(finished)
     })
 }
 
-fn parts<'a>(
-    facts: &'a [GridFacts],
-    trees: &'a [SequenceTree],
-    allocations: &'a [Allocation],
-) -> Vec<GridParts<'a>> {
-    let each = facts.iter().zip(trees).zip(allocations);
-    each.map(|((facts, tree), allocation)| GridParts { facts, tree, allocation }).collect()
-}
-
-/// Keeps what was made of bricks.
-fn save(encoders: &mut [EncoderCache], trees: &[SequenceTree]) -> Result<()> {
-    Ok(encoders.iter_mut().zip(trees).try_for_each(|(encoders, tree)| encoders.save(tree))?)
+fn parts<'a>(grids: &'a [GridBuild], allocations: &'a [Allocation]) -> Vec<GridParts<'a>> {
+    let each = grids.iter().zip(allocations);
+    each.map(|(GridBuild { facts, tree, .. }, allocation)| GridParts { facts, tree, allocation }).collect()
 }
 
 /// Opens a pack and checks as much of it as the job asks.

@@ -40,9 +40,10 @@ impl EncodedGrid {
         if !allocation.error_l2s.are_known {
             let mut errors = BrickErrors::new(&grid.tree.scratch);
             // Those of clusters are known: quantising adds those of bricks that have texels of their own.
-            for id in (0..allocation.len()).filter(|&id| !matches!(allocation.coding(id), Coding::Own(_))) {
-                errors.put(id, &allocation.error_l2s.read(&[id])?)?;
-            }
+            let is_clustered = |&id: &u32| !matches!(allocation.coding(id), Coding::Own(_));
+            let clustered: Vec<u32> = (0..allocation.len()).filter(is_clustered).collect();
+            let known = allocation.error_l2s.read(&clustered)?;
+            clustered.iter().zip(known).try_for_each(|(&id, error_l2)| errors.put(id, &[error_l2]))?;
             error_l2s = Some(errors);
         }
         Ok(Self { axes: vec![2; allocation.len() as usize], error_l2s })

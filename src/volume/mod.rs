@@ -1,6 +1,6 @@
 //! Coordinates, masks, bricks and frames: the types that flow down the stages.
 //!
-//! This room knows nothing of OpenVDB files, codecs or packs.
+//! This module knows nothing of OpenVDB files, codecs or packs.
 
 mod blocks;
 mod brick;

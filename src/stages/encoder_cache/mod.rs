@@ -265,26 +265,17 @@ impl EncoderCache {
         &self.terms
     }
 
-    /// The batches that some bricks, ascending, are in.
-    fn batches_of(&self, ids: &[u32]) -> BTreeSet<usize> {
-        ids.iter().map(|id| self.batches.partition_point(|batch| batch.ids.end <= *id)).collect()
-    }
-
     fn load(&mut self, tree: &SequenceTree, ids: &[u32], kinds: &[Kind]) -> ScratchResult<()> {
-        if self.earlier.is_none() {
-            return Ok(());
-        }
+        let Some(earlier) = &mut self.earlier else { return Ok(()) };
         let mut wanted = Vec::new();
-        for batch in self.batches_of(ids) {
+        for batch in batches_of(&self.batches, ids) {
             for &kind in kinds {
                 if !std::mem::replace(&mut self.is_loaded[batch][kind.index()], true) {
                     wanted.push((batch, kind));
                 }
             }
         }
-        if let Some(earlier) = &mut self.earlier {
-            earlier.load(&mut self.memo, tree, &self.batches, &wanted)?;
-        }
+        earlier.load(&mut self.memo, tree, &self.batches, &wanted)?;
         self.memo.flush()
     }
 
@@ -385,8 +376,8 @@ impl EncoderCache {
                 made?.iter().zip(kinds).try_for_each(|(made, kind)| self.memo.add(*kind, ids, made))?;
             }
             self.memo.flush()?;
-            let batches = self.batches_of(&missing);
             if let Some(earlier) = &mut self.earlier {
+                let batches = batches_of(&self.batches, &missing);
                 kinds.iter().for_each(|&kind| earlier.note_made(&batches, kind));
             }
             if self.saved.elapsed() > SAVE_EVERY {
@@ -456,6 +447,11 @@ pub fn own_range(sequence: &SequenceRange, mode: RangeMode, values: ValueRange) 
         RangeMode::Sequence => BrickRange::SEQUENCE,
         RangeMode::Brick => sequence.fit(values.min, values.max),
     }
+}
+
+/// The places of the batches that some bricks, ascending, are in.
+fn batches_of(batches: &[Batch], ids: &[u32]) -> BTreeSet<usize> {
+    ids.iter().map(|id| batches.partition_point(|batch| batch.ids.end <= *id)).collect()
 }
 
 /// The batches of a grid, in the order of its pool.
