@@ -31,7 +31,7 @@
 //!
 //! let folder = tempfile::tempdir()?;
 //! let path = folder.path().join("fog.volpack");
-//! let settings = Settings { encoding: Format::Bc7.into(), ..Settings::default() };
+//! let settings = Settings { encoding: Format::BC7.into(), ..Settings::default() };
 //! let job = Job::new(vec!["fixtures/fog_half_blosc.vdb".into()], path.clone(), settings, VerifyLevel::Voxels);
 //! let outcome = build(&job, &mut Silent)?;
 //! assert!(outcome.verification.is_some_and(|report| report.ok));

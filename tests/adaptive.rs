@@ -16,7 +16,7 @@ use volpack::error::Error;
 use volpack::pack::{Pack, Provenance, Region};
 use volpack::pipeline::{Job, Outcome, Silent, VerifyLevel, build};
 use volpack::settings::{
-    Clustering, Encoding, FRAME_MARGIN_DB, Format, NonFinite, Quality, Settings, UniformCodec,
+    Clustering, Encoding, FRAME_MARGIN_DB, Format, NonFinite, Quality, Settings, TexelCodec,
 };
 use volpack::sweep::{Options, stability};
 use volpack::vdb::{Tree, VdbFile};
@@ -59,7 +59,7 @@ impl Case {
     }
 
     fn clustered(&self, clustering: Clustering) -> Settings {
-        let encoding = Encoding::Uniform { codec: UniformCodec::Bc7, clustering: Some(clustering) };
+        let encoding = Encoding::Uniform { codec: TexelCodec::BC7, clustering: Some(clustering) };
         Settings { grids: self.grids.clone(), encoding, ..Settings::default() }
     }
 

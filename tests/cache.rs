@@ -13,7 +13,7 @@ use serde_json::Value as Json;
 use volpack::cache::Cache;
 use volpack::pipeline::{Job, Made, Outcome, Progress, Silent, VerifyLevel, build};
 use volpack::settings::{
-    Clustering, Encoding, ErrorBound, Format, Masks, NonFinite, Quality, RangeMode, Settings, UniformCodec,
+    Clustering, Encoding, ErrorBound, Format, Masks, NonFinite, Quality, RangeMode, Settings, TexelCodec,
 };
 
 /// A folder with a cache and the frames of an animation that may be edited.
@@ -81,7 +81,7 @@ fn of_format(format: Format) -> Settings {
 }
 
 fn clustered(clustering: Clustering) -> Encoding {
-    Encoding::Uniform { codec: UniformCodec::Bc7, clustering: Some(clustering) }
+    Encoding::Uniform { codec: TexelCodec::BC7, clustering: Some(clustering) }
 }
 
 /// Settings that share parts of each other's work in every way.
@@ -105,15 +105,15 @@ fn variety() -> Vec<Settings> {
         Settings { zstd: 19, ..psnr(46.0) },
         Settings { nonfinite: NonFinite::Zero, ..psnr(45.0) },
         Settings { fps: Some(24.0), ..psnr(45.0) },
-        of_format(Format::Bc7),
-        of_format(Format::Bc4),
-        of_format(Format::Unorm8),
+        of_format(Format::BC7),
+        of_format(Format::BC4),
+        of_format(Format::UNORM8),
         of_format(Format::F16),
         Settings { zstd: 7, ..of_format(Format::F16) },
         of_format(Format::F32),
         Settings {
             encoding: clustered(Clustering { clusters: 8, ..Clustering::default() }),
-            ..of_format(Format::Bc7)
+            ..of_format(Format::BC7)
         },
     ]
 }
@@ -142,7 +142,7 @@ fn no_choice_of_frames_changes_a_pack() {
     let frames = shop.frames();
     // The first of two frames that share bricks has them: who that is depends on who else is there.
     for choice in [&frames[..], &frames[3..], &frames[..5], &frames[2..3], &frames[..]] {
-        for settings in [&variety()[0], &variety()[5], &of_format(Format::Bc7)] {
+        for settings in [&variety()[0], &variety()[5], &of_format(Format::BC7)] {
             shop.build_and_compare(choice, settings);
         }
     }

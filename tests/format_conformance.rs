@@ -22,7 +22,7 @@ use volpack::codec::Codec;
 use volpack::pack::layout::{AtlasRecord, FrameRecord, kind};
 use volpack::pack::tree::{L3Record, header};
 use volpack::pack::{Atlas, Pack, Region};
-use volpack::settings::{Clustering, Encoding, Format, Quality, Settings, UniformCodec};
+use volpack::settings::{Clustering, Encoding, Format, Quality, Settings, TexelCodec};
 use volpack::vdb::{Accessor, Scalar, VdbFile, with_scalar_type};
 use volpack::volume::{BRICK_DIM, CELL_DIM, Coord, CoordBox};
 
@@ -49,11 +49,11 @@ fn cases() -> Vec<Case> {
     vec![
         case("f32", &["tiles"], settings(&[], Format::F32, 0)),
         case("f16", &["inactive_half"], settings(&[], Format::F16, 0)),
-        case("unorm8", &["levelset_half"], settings(&[], Format::Unorm8, 0)),
-        case("bc4", anim, settings(both, Format::Bc4, 0)),
-        case("bc7", anim, settings(both, Format::Bc7, 0)),
-        Case { change: use_every_mode, ..case("bc7_modes", &["anim_0001"], settings(&[], Format::Bc7, 0)) },
-        Case { change: use_small_slabs, ..case("slabs", anim, settings(both, Format::Bc7, 0)) },
+        case("unorm8", &["levelset_half"], settings(&[], Format::UNORM8, 0)),
+        case("bc4", anim, settings(both, Format::BC4, 0)),
+        case("bc7", anim, settings(both, Format::BC7, 0)),
+        Case { change: use_every_mode, ..case("bc7_modes", &["anim_0001"], settings(&[], Format::BC7, 0)) },
+        Case { change: use_small_slabs, ..case("slabs", anim, settings(both, Format::BC7, 0)) },
         case(
             "adaptive",
             &["adversarial"],
@@ -64,10 +64,10 @@ fn cases() -> Vec<Case> {
             &["anim_0003", "anim_0004", "anim_0005", "anim_0006"],
             Settings {
                 encoding: Encoding::Uniform {
-                    codec: UniformCodec::Bc7,
+                    codec: TexelCodec::BC7,
                     clustering: Some(Clustering { clusters: 4, ..Clustering::default() }),
                 },
-                ..settings(&["density"], Format::Bc7, 0)
+                ..settings(&["density"], Format::BC7, 0)
             },
         ),
         case("f32_zstd", &["inactive_float"], settings(&[], Format::F32, 3)),

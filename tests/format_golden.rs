@@ -17,7 +17,7 @@ fn the_same_frames_give_the_kept_bytes() {
     // No block format and no zstd: their bytes depend on the encoder's instruction set and version.
     let settings = Settings {
         grids: vec!["density".to_owned(), "temperature".to_owned()],
-        encoding: Format::Unorm8.into(),
+        encoding: Format::UNORM8.into(),
         zstd: 0,
         ..Settings::default()
     };

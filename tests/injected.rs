@@ -122,7 +122,7 @@ fn values(bytes: &[u8]) -> Vec<u32> {
 #[test]
 fn swapped_bricks_wrong_axes_and_wrong_ranks_are_found() {
     let folder = tempfile::tempdir().unwrap();
-    let victim = Victim::new("fog_half_zip.vdb", "density", Format::Bc7, folder.path());
+    let victim = Victim::new("fog_half_zip.vdb", "density", Format::BC7, folder.path());
     let swapped = victim.tree(|words| {
         let r = records(words);
         let (a, b) = (words[r[3]], words[r[10]]);
@@ -148,7 +148,7 @@ fn swapped_bricks_wrong_axes_and_wrong_ranks_are_found() {
 #[test]
 fn wrong_inactive_rules_and_masks_are_found() {
     let folder = tempfile::tempdir().unwrap();
-    let victim = Victim::new("levelset_half.vdb", "surface", Format::Unorm8, folder.path());
+    let victim = Victim::new("levelset_half.vdb", "surface", Format::UNORM8, folder.path());
     let rule = victim.tree(|words| {
         // From "background" to "minus background".
         let r = records(words).into_iter().find(|r| words[r + 1] >> 30 == 0).unwrap();
@@ -167,7 +167,7 @@ fn wrong_inactive_rules_and_masks_are_found() {
 #[test]
 fn an_error_norm_that_is_no_number_passes_nothing() {
     let folder = tempfile::tempdir().unwrap();
-    let victim = Victim::new("fog_half_zip.vdb", "density", Format::Bc7, folder.path());
+    let victim = Victim::new("fog_half_zip.vdb", "density", Format::BC7, folder.path());
     for error_l2 in [f64::NAN, f64::INFINITY, 0.0] {
         let found = victim.verdict(|bytes| {
             let at = Victim::section(bytes, kind::FRAMES) + offset_of!(FrameRecord, error_l2);
@@ -182,7 +182,7 @@ fn an_error_norm_that_is_no_number_passes_nothing() {
 fn tables_that_say_another_thing_are_found() {
     let folder = tempfile::tempdir().unwrap();
     let sources = vec![fixture("anim_0001.vdb"), fixture("anim_0002.vdb")];
-    let victim = Victim::of(sources, "density", Format::Unorm8, folder.path());
+    let victim = Victim::of(sources, "density", Format::UNORM8, folder.path());
     let changed = |section: u32, at: usize, to: [u8; 4]| {
         victim.verdict(|bytes| {
             let at = Victim::section(bytes, section) + at;

@@ -122,7 +122,7 @@ fn labels_stay_labels() {
         }
     });
     // A format that cannot keep them says so.
-    let bc7 = Settings { encoding: Format::Bc7.into(), ..default.clone() };
+    let bc7 = Settings { encoding: Format::BC7.into(), ..default.clone() };
     let (_, report) = unverified(&path, bc7.clone(), folder.path());
     assert!(report.failures.iter().any(|why| why.contains("integer")), "{:?}", report.failures);
     let nearest = Settings { integers: Integers::Nearest, ..bc7 };
@@ -199,11 +199,11 @@ fn every_format_keeps_its_promise_on_every_fixture() {
             if !grid.value_type.is_scalar() || grid.transform.matrix.is_none() {
                 continue;
             }
-            for format in [Format::F16, Format::Unorm8, Format::Bc4, Format::Bc7] {
+            for format in [Format::F16, Format::UNORM8, Format::BC4, Format::BC7] {
                 // A coarse level set may well flip signs; that is a failure of its own.
                 let too_coarse = path.ends_with("levelset_half.vdb") || path.ends_with("levelset_float.vdb");
                 if format == Format::F16 && !in_half
-                    || too_coarse && matches!(format, Format::Bc4 | Format::Bc7)
+                    || too_coarse && matches!(format, Format::BC4 | Format::BC7)
                 {
                     continue;
                 }
@@ -302,7 +302,7 @@ fn a_frame_lists_the_chunks_of_its_bricks_and_no_others() {
 fn brick_ranges_are_finer_than_the_sequences() {
     let folder = tempfile::tempdir().unwrap();
     let psnr = |range| {
-        let settings = Settings { range, ..settings("density", Format::Unorm8) };
+        let settings = Settings { range, ..settings("density", Format::UNORM8) };
         build_verified(&[fixture("fog_half_blosc.vdb")], settings, folder.path()).1.active.psnr.unwrap()
     };
     assert!(psnr(RangeMode::Brick) > psnr(RangeMode::Sequence) + 3.0);
@@ -313,7 +313,7 @@ fn several_grids_keep_their_own_frames_and_ranges() {
     let folder = tempfile::tempdir().unwrap();
     let settings = Settings {
         grids: vec!["temperature".to_owned(), "density".to_owned()],
-        encoding: Format::Unorm8.into(),
+        encoding: Format::UNORM8.into(),
         fps: Some(24.0),
         ..Settings::default()
     };
@@ -344,7 +344,7 @@ fn an_empty_frame_is_a_frame() {
             copy
         })
         .collect();
-    let (pack, report) = build_verified(&frames, settings("density", Format::Bc7), folder.path());
+    let (pack, report) = build_verified(&frames, settings("density", Format::BC7), folder.path());
     assert!(report.ok, "{:?}", report.failures);
     let leaves: Vec<_> = pack.grids()[0].frames.iter().map(|f| f.record.leaves > 0).collect();
     assert_eq!(leaves, [false, true, false, true, false]);
@@ -361,7 +361,7 @@ fn the_tree_stays_within_its_budget() {
         (vec![fixture("tiles.vdb")], "density"),
         (vec![fixture("negative.vdb")], "density"),
     ] {
-        let (pack, _) = build_verified(&frames, settings(grid, Format::Unorm8), folder.path());
+        let (pack, _) = build_verified(&frames, settings(grid, Format::UNORM8), folder.path());
         let summary = PackSummary::new(&pack);
         let grid = &pack.grids()[0];
         let cells: u64 = (0..3).map(|a| u64::from(grid.cells[a]) * u64::from(grid.roots[a])).product();

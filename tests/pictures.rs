@@ -201,7 +201,7 @@ fn only_rays_that_read_bc4_are_said_to() {
     let folder = tempfile::tempdir().unwrap();
     // Two balls far from each other, each of which fills the pictures' middle from one side.
     let frames = write(folder.path(), &[ball(0.1, [0.0; 3], 3, [1.2; 3], 0.9)]);
-    for (format, expected) in [(Format::Bc4, true), (Format::Bc7, false), (Format::F32, false)] {
+    for (format, expected) in [(Format::BC4, true), (Format::BC7, false), (Format::F32, false)] {
         let pack = built(&frames, settings(format), folder.path());
         let scene = Scene::new(&pack.grids()[0], 0, &View::default(), Mode::Density, SIZE);
         let (image, reads_bc4) = trace_noting_bc4::<f32>(&field(&pack, 0), &scene).unwrap();

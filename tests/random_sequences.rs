@@ -199,7 +199,7 @@ fn settings(rng: &mut Xoshiro256PlusPlus) -> Vec<Settings> {
         Quality::BitsPerVoxel(rng.gen_range(0.5..12.0)),
     ];
     let adaptive = qualities.map(|quality| Settings { encoding: quality.into(), ..Settings::default() });
-    let uniform = Format::ALL[rng.gen_range(0..5)];
+    let uniform = Format::ALL[1 + rng.gen_range(0..5)];
     let mut all = adaptive.to_vec();
     all.push(Settings { encoding: uniform.into(), ..Settings::default() });
     for settings in &mut all {
@@ -212,7 +212,7 @@ fn settings(rng: &mut Xoshiro256PlusPlus) -> Vec<Settings> {
 
 /// Why a good pack may be refused all the same.
 fn may_be_refused(sequence: &Sequence, settings: &Settings, why: &str) -> bool {
-    let blocks = matches!(settings.format(), Format::Unorm8 | Format::Bc4 | Format::Bc7);
+    let blocks = matches!(settings.format(), Format::UNORM8 | Format::BC4 | Format::BC7);
     let is_level_set = matches!(sequence.field, DecodedFrame::LevelSet);
     let is_little = ["cannot be reached, the least is", "the pack has none of its", "is under 20 dB"];
     settings.quality().is_size() && is_little.iter().any(|little| why.contains(little))

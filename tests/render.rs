@@ -196,7 +196,7 @@ fn pictures_look_as_they_did() {
 fn the_gpu_decodes_any_bc7_block_as_the_cpu_does() {
     let Some(gpu) = gpu() else { return };
     let folder = tempfile::tempdir().unwrap();
-    let settings = Settings { encoding: Format::Bc7.into(), zstd: 0, ..Settings::default() };
+    let settings = Settings { encoding: Format::BC7.into(), zstd: 0, ..Settings::default() };
     build_verified(&[fixture("fog_half_zip.vdb")], settings, folder.path());
     let mut bytes = std::fs::read(folder.path().join("test.volpack")).unwrap();
     let sections = bytes[64..].chunks_exact(80).map(bytemuck::pod_read_unaligned::<Section>);

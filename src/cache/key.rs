@@ -4,9 +4,9 @@ use serde::Serialize;
 
 use super::artefact;
 
-/// A stage whose results are kept.
+/// The entries of one kind that a stage keeps.
 #[derive(Clone, Copy, Debug)]
-pub struct Stage {
+pub struct Namespace {
     /// Its name, at most 16 ASCII letters.
     pub name: &'static str,
     /// To be raised whenever the same inputs give another result, or the result another layout.
@@ -25,13 +25,13 @@ pub struct Key {
 
 impl Key {
     /// The key of a stage's result for some inputs.
-    pub fn new(stage: &Stage, inputs: &(impl Serialize + ?Sized)) -> Self {
+    pub fn new(namespace: &Namespace, inputs: &(impl Serialize + ?Sized)) -> Self {
         let mut hasher = blake3::Hasher::new();
-        for part in [stage.name, env!("CARGO_PKG_VERSION")] {
+        for part in [namespace.name, env!("CARGO_PKG_VERSION")] {
             hasher.update(&(part.len() as u64).to_le_bytes()).update(part.as_bytes());
         }
-        hasher.update(&stage.version.to_le_bytes()).update(&artefact::encode(inputs));
-        Self { stage: stage.name, digest: hasher.finalize().into(), travels: stage.travels }
+        hasher.update(&namespace.version.to_le_bytes()).update(&artefact::encode(inputs));
+        Self { stage: namespace.name, digest: hasher.finalize().into(), travels: namespace.travels }
     }
 
     /// Whether the result goes to a remote too.

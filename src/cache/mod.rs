@@ -30,7 +30,7 @@ use schemars::JsonSchema;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-pub use key::{Key, Stage};
+pub use key::{Key, Namespace};
 pub use maintain::{Damage, Stats};
 
 use remote::Remote;

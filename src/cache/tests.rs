@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime};
 
 use super::*;
 
-const STAGE: Stage = Stage { name: "test", version: 1, travels: true };
+const STAGE: Namespace = Namespace { name: "test", version: 1, travels: true };
 
 fn files(folder: &Path) -> Vec<PathBuf> {
     let entries = fs::read_dir(folder).into_iter().flatten().map(|e| e.unwrap().path());
@@ -27,8 +27,8 @@ fn what_was_put_is_found_under_its_key_alone() {
     assert_eq!(cache.get(&key), Some(vec![1u32, 2, 3]));
     for other in [
         Key::new(&STAGE, &("input", 1.6f32)),
-        Key::new(&Stage { version: 2, ..STAGE }, &("input", 1.5f32)),
-        Key::new(&Stage { name: "tes", version: 1, travels: true }, &("input", 1.5f32)),
+        Key::new(&Namespace { version: 2, ..STAGE }, &("input", 1.5f32)),
+        Key::new(&Namespace { name: "tes", version: 1, travels: true }, &("input", 1.5f32)),
     ] {
         assert_eq!(cache.get::<Vec<u32>>(&other), None);
     }
@@ -70,7 +70,7 @@ fn another_type_of_value_is_a_miss() {
 #[test]
 fn an_entry_moved_to_another_place_is_not_taken_for_what_belongs_there() {
     let (folder, cache, key) = filled();
-    let other = Key::new(&Stage { name: "other", version: 1, travels: true }, &0);
+    let other = Key::new(&Namespace { name: "other", version: 1, travels: true }, &0);
     let action = files(&folder.path().join("actions")).pop().unwrap();
     let to = cache.store.path(Map::Actions, other.digest());
     fs::create_dir_all(to.parent().unwrap()).unwrap();

@@ -11,7 +11,7 @@ use volpack_format::codec::{PACKING_STRIDES, decode_texels};
 use super::blocks::by_slice;
 use super::normalise::normalise;
 use super::plain::unorm8;
-use super::{Codec, Encoded, SequenceRange, Texels};
+use super::{Codec, EncodedBricks, SequenceRange, Texels};
 use crate::volume::BRICK_VOXELS;
 
 const BLOCK: usize = 16;
@@ -22,13 +22,13 @@ const WIDTH: usize = 16;
 /// Surfaces are at least this wide: the encoder runs a row through its SIMD lanes.
 const LEAST_WIDTH: usize = 64;
 
-pub(super) fn encode(sequence: &SequenceRange, batch: &[Texels]) -> Encoded {
+pub(super) fn encode(sequence: &SequenceRange, batch: &[Texels]) -> EncodedBricks {
     let fractions: Vec<[f32; BRICK_VOXELS]> =
         batch.iter().map(|brick| normalise(sequence, brick.range, &brick.values)).collect();
     let unorms: Vec<[u8; BRICK_VOXELS]> = fractions.iter().map(unorm8).collect();
     let by_axis = [0, 1, 2].map(|axis| encode_axis(&unorms, axis));
 
-    let mut out = Encoded { bytes: Vec::with_capacity(batch.len() * BRICK), axes: Vec::new() };
+    let mut out = EncodedBricks { bytes: Vec::with_capacity(batch.len() * BRICK), axes: Vec::new() };
     for (i, (brick, fractions)) in batch.iter().zip(&fractions).enumerate() {
         let bytes = |axis: u8| &by_axis[usize::from(axis)][i * BRICK..][..BRICK];
         let counts = brick.texel_mask.weights();

@@ -8,9 +8,11 @@ mod bc7;
 mod blocks;
 mod normalise;
 mod plain;
+mod table;
 
 use rayon::prelude::*;
 
+pub use table::{CachePolicy, TexelCodec};
 pub use volpack_format::Half;
 pub use volpack_format::codec::{
     BrickLayout, BrickRange, Codec, Fidelity, SequenceRange, TextureFormat, decode, spread,
@@ -42,12 +44,19 @@ impl Texels {
     }
 }
 
-/// The encoded bricks of one batch.
-pub struct Encoded {
+/// Some bricks, encoded.
+pub struct EncodedBricks {
     /// [`BrickLayout::brick_bytes`] a brick, one after another.
     pub bytes: Vec<u8>,
-    /// The packing axis of each brick: 0, 1 or 2 for x, y or z. Always 2 but for bc7.
+    /// The packing axis of each brick: 0, 1 or 2 for x, y or z; 2 for a codec whose channels run along none.
     pub axes: Vec<u8>,
+}
+
+impl EncodedBricks {
+    /// Bricks of a codec whose channels run along no axis.
+    fn without_axes(bytes: Vec<u8>, bricks: usize) -> Self {
+        Self { bytes, axes: vec![2; bricks] }
+    }
 }
 
 /// A value that a codec cannot hold.
@@ -66,30 +75,21 @@ pub const BATCH: usize = 64;
 ///
 /// # Errors
 /// [`OutOfRange`] for values past 65,504 with [`Codec::F16`].
-pub fn encode(codec: Codec, sequence: &SequenceRange, bricks: &[Texels]) -> Result<Encoded, OutOfRange> {
-    let batches: Vec<Encoded> = bricks
+pub fn encode(
+    codec: TexelCodec,
+    sequence: &SequenceRange,
+    bricks: &[Texels],
+) -> Result<EncodedBricks, OutOfRange> {
+    let batches: Vec<EncodedBricks> = bricks
         .par_chunks(BATCH)
-        .map(|batch| encode_batch(codec, sequence, batch))
+        .map(|batch| codec.encode_batch(sequence, batch))
         .collect::<Result<_, _>>()?;
-    let mut all = Encoded { bytes: Vec::new(), axes: Vec::new() };
+    let mut all = EncodedBricks { bytes: Vec::new(), axes: Vec::new() };
     for batch in batches {
         all.bytes.extend(batch.bytes);
         all.axes.extend(batch.axes);
     }
     Ok(all)
-}
-
-fn encode_batch(codec: Codec, sequence: &SequenceRange, batch: &[Texels]) -> Result<Encoded, OutOfRange> {
-    let plain_axes = vec![2; batch.len()];
-    let bytes = match codec {
-        Codec::Constant => Vec::new(),
-        Codec::Bc7 => return Ok(bc7::encode(sequence, batch)),
-        Codec::Bc4 => bc4::encode(sequence, batch),
-        Codec::Unorm8 => plain::encode_unorm8(sequence, batch),
-        Codec::F16 => plain::encode_f16(batch)?,
-        Codec::F32 => plain::encode_f32(batch),
-    };
-    Ok(Encoded { bytes, axes: plain_axes })
 }
 
 /// The instruction set that `intel_tex_2` picks on this machine. Its SSE and AVX paths differ in a

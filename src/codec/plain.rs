@@ -59,6 +59,17 @@ pub(super) fn encode_f16(batch: &[Texels]) -> Result<Vec<u8>, OutOfRange> {
     Ok(out)
 }
 
+/// Values as half floats give them back; `None` if one is past the greatest, which those just above it would round to.
+pub(super) fn round_to_f16(values: &[f32; BRICK_VOXELS]) -> Option<[f32; BRICK_VOXELS]> {
+    if !values.iter().all(|v| v.abs() <= f16::MAX.to_f32()) {
+        return None;
+    }
+    let (mut halves, mut rounded) = ([f16::ZERO; BRICK_VOXELS], [0.0; BRICK_VOXELS]);
+    halves.convert_from_f32_slice(values);
+    halves.convert_to_f32_slice(&mut rounded);
+    Some(rounded)
+}
+
 pub(super) fn encode_f32(batch: &[Texels]) -> Vec<u8> {
     let mut out = Vec::with_capacity(batch.len() * BRICK_VOXELS * 4);
     for brick in batch {

@@ -155,7 +155,7 @@ fn unknown_setting(error: &serde_json::Error) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::settings::{DEFAULT_ZSTD, Encoding, Quality, UniformCodec};
+    use crate::settings::{DEFAULT_ZSTD, Encoding, Quality, TexelCodec};
 
     fn provenance() -> Provenance {
         Provenance {
@@ -180,7 +180,7 @@ mod tests {
         let without_zstd =
             Provenance { settings: Settings { zstd: DEFAULT_ZSTD, ..provenance().settings }, ..provenance() };
         assert_eq!(read("\"zstd\": 0,", "").unwrap(), without_zstd);
-        let clustered = Encoding::Uniform { codec: UniformCodec::Bc7, clustering: Some(Default::default()) };
+        let clustered = Encoding::Uniform { codec: TexelCodec::BC7, clustering: Some(Default::default()) };
         let provenance_of_bc7 = Provenance {
             settings: Settings { encoding: clustered, ..provenance().settings },
             ..provenance()

@@ -73,14 +73,13 @@ pub(super) fn allocate(
     let Encoding::Uniform { codec, clustering } = &settings.encoding else {
         return adaptive(grids, settings, progress);
     };
-    let codec = codec.codec();
     let mut allocations = Vec::new();
     for GridBuild { facts, tree, encoders, .. } in grids {
         allocations.push(match clustering {
-            None => allocate::uniform(tree, encoders, codec),
+            None => allocate::uniform(tree, encoders, *codec),
             Some(clustering) => {
                 progress.stage("cluster", tree.pool.len().into(), "bricks");
-                allocate::clustered(&facts.name, tree, encoders, codec, settings.range, clustering)?
+                allocate::clustered(&facts.name, tree, encoders, *codec, settings.range, clustering)?
             }
         });
     }

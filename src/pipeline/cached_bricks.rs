@@ -1,6 +1,6 @@
 //! What earlier builds made of a frame's bricks, put around the encoder cache and the search.
 //!
-//! One entry for each batch of bricks and kind. An entry grows: what a later build asks for is added to it, and nothing
+//! One entry for each batch of bricks and trial. An entry grows: what a later build asks for is added to it, and nothing
 //! in it is made again.
 
 use std::collections::BTreeSet;
@@ -9,20 +9,20 @@ use std::sync::Arc;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::cache::{Cache, Key, Stage};
+use crate::cache::{Cache, Key, Namespace};
 use crate::codec::encoder_isa;
 use crate::pods;
 use crate::stages::allocate::{EarlierOffers, OfferInputs, Offers};
 use crate::stages::dedup::SequenceTree;
-use crate::stages::encoder_cache::{Batch, EarlierResults, EncoderCache, KeptCodec, Kind, Made, Memo, Note};
+use crate::stages::encoder_cache::{Batch, EarlierResults, EncoderCache, Memo, Note, Trial, TrialResults};
 use crate::volume::ScratchResult;
 
 /// Entries that a remote is asked for together.
 const PREFETCHED: usize = 64;
 
-const STAGE: Stage = Stage { name: "encode", version: 2, travels: false };
-const BASE: Stage = Stage { name: "batch", version: 1, travels: false };
-const OFFERS: Stage = Stage { name: "share", version: 2, travels: true };
+const ENCODE: Namespace = Namespace { name: "encode", version: 2, travels: false };
+const BASE: Namespace = Namespace { name: "batch", version: 1, travels: false };
+const OFFERS: Namespace = Namespace { name: "share", version: 2, travels: true };
 
 /// Where the results of one grid's frames are kept.
 pub struct GridCache {
@@ -37,8 +37,8 @@ pub(super) struct CachedBricks {
     cache: Arc<Cache>,
     /// For each batch what stands for the frame, the batch's place in it and all that its results depend on.
     bases: Arc<[Key]>,
-    /// For each batch and kind, whether its entry lacks something.
-    is_changed: Vec<[bool; Kind::ALL.len()]>,
+    /// For each batch and trial, whether its entry lacks something.
+    is_changed: Vec<[bool; Trial::ALL.len()]>,
 }
 
 /// The offers of one grid's batches.
@@ -56,15 +56,15 @@ struct Entry {
     /// is active in any of them counts.
     #[serde(with = "pods")]
     actives: Vec<u64>,
-    made: Made,
+    made: TrialResults,
 }
 
 /// What the cache has of a batch.
 struct Found {
-    kind: Kind,
+    trial: Trial,
     /// Bricks of the pool.
     ids: Vec<u32>,
-    made: Made,
+    made: TrialResults,
 }
 
 /// Puts the cache around one grid's encoders, and gives what it has for the search.
@@ -82,10 +82,10 @@ pub(super) fn wrap(encoders: &mut EncoderCache, grid: GridCache) -> CachedOffers
 }
 
 impl CachedBricks {
-    fn key(&self, batch: usize, kind: Kind) -> Key {
-        // The other codecs are made as fast as a network brings their texels.
-        let stage = Stage { travels: kind == Kind::Texels(KeptCodec::Bc7), ..STAGE };
-        Key::new(&stage, &(self.bases[batch].digest(), kind))
+    fn key(&self, batch: usize, trial: Trial) -> Key {
+        // Others are made as fast as a network brings their texels.
+        let travels = matches!(trial, Trial::Texels(codec) if codec.is_on_demand());
+        Key::new(&Namespace { travels, ..ENCODE }, &(self.bases[batch].digest(), trial))
     }
 
     fn find(
@@ -93,10 +93,10 @@ impl CachedBricks {
         tree: &SequenceTree,
         batches: &[Batch],
         batch: usize,
-        kind: Kind,
+        trial: Trial,
     ) -> ScratchResult<Option<Found>> {
-        let entry = self.cache.get::<Entry>(&self.key(batch, kind));
-        let Some(all) = entry.filter(|entry| entry.is_sound(kind)) else { return Ok(None) };
+        let entry = self.cache.get::<Entry>(&self.key(batch, trial));
+        let Some(all) = entry.filter(|entry| entry.is_sound(trial)) else { return Ok(None) };
         let wanted: Vec<u32> = batches[batch].ids.clone().collect();
         let (mut ids, mut places) = (Vec::new(), Vec::new());
         for (&id, active) in wanted.iter().zip(tree.pool.active_hashes(&wanted)?) {
@@ -107,11 +107,11 @@ impl CachedBricks {
             }
         }
         if places.len() == all.places.len() {
-            return Ok(Some(Found { kind, ids, made: all.made }));
+            return Ok(Some(Found { trial, ids, made: all.made }));
         }
-        let mut made = Made::default();
-        places.into_iter().for_each(|i| push_from(&mut made, &all.made, i, kind));
-        Ok(Some(Found { kind, ids, made }))
+        let mut made = TrialResults::default();
+        places.into_iter().for_each(|i| push_from(&mut made, &all.made, i, trial));
+        Ok(Some(Found { trial, ids, made }))
     }
 }
 
@@ -121,12 +121,12 @@ impl EarlierResults for CachedBricks {
         memo: &mut Memo,
         tree: &SequenceTree,
         batches: &[Batch],
-        wanted: &[(usize, Kind)],
+        wanted: &[(usize, Trial)],
     ) -> ScratchResult<()> {
-        let find = |&(batch, kind): &(usize, Kind)| self.find(tree, batches, batch, kind);
+        let find = |&(batch, trial): &(usize, Trial)| self.find(tree, batches, batch, trial);
         for wanted in wanted.chunks(PREFETCHED) {
-            self.cache.prefetch(wanted.iter().map(|&(batch, kind)| self.key(batch, kind)));
-            let read = |group: &[(usize, Kind)]| -> ScratchResult<Vec<Option<Found>>> {
+            self.cache.prefetch(wanted.iter().map(|&(batch, trial)| self.key(batch, trial)));
+            let read = |group: &[(usize, Trial)]| -> ScratchResult<Vec<Option<Found>>> {
                 group.par_iter().map(find).collect()
             };
             let mut groups = wanted.chunks(2 * rayon::current_num_threads());
@@ -140,7 +140,7 @@ impl EarlierResults for CachedBricks {
                         scope.spawn(move |_| *later = read(next));
                     }
                     let mut found = found?.into_iter().flatten();
-                    found.try_for_each(|Found { kind, ids, made }| memo.add(kind, &ids, &made))
+                    found.try_for_each(|Found { trial, ids, made }| memo.add(trial, &ids, &made))
                 })?;
                 if next.is_none() {
                     break;
@@ -151,26 +151,26 @@ impl EarlierResults for CachedBricks {
         Ok(())
     }
 
-    fn note_made(&mut self, batches: &BTreeSet<usize>, kind: Kind) {
-        batches.iter().for_each(|&batch| self.is_changed[batch][kind.index()] = true);
+    fn note_made(&mut self, batches: &BTreeSet<usize>, trial: Trial) {
+        batches.iter().for_each(|&batch| self.is_changed[batch][trial.index()] = true);
     }
 
     fn save(&mut self, memo: &Memo, tree: &SequenceTree, batches: &[Batch]) -> ScratchResult<()> {
         for (b, batch) in batches.iter().enumerate() {
-            for kind in Kind::ALL {
-                if !std::mem::take(&mut self.is_changed[b][kind.index()]) {
+            for trial in Trial::ALL {
+                if !std::mem::take(&mut self.is_changed[b][trial.index()]) {
                     continue;
                 }
-                let key = self.key(b, kind);
-                let known: Vec<u32> = batch.ids.clone().filter(|&id| memo.is_known(kind, id)).collect();
+                let key = self.key(b, trial);
+                let known: Vec<u32> = batch.ids.clone().filter(|&id| memo.is_known(trial, id)).collect();
                 let entry = Entry {
                     places: known.iter().map(|&id| tree.pool.place(id)).collect(),
                     actives: tree.pool.active_hashes(&known)?,
-                    made: memo.made(kind, &known)?,
+                    made: memo.made(trial, &known)?,
                 };
                 // Another build may have asked for other bricks of the frame.
-                let others = self.cache.peek::<Entry>(&key).filter(|entry| entry.is_sound(kind));
-                self.cache.put(&key, &entry.union(&others.unwrap_or_default(), kind));
+                let others = self.cache.peek::<Entry>(&key).filter(|entry| entry.is_sound(trial));
+                self.cache.put(&key, &entry.union(&others.unwrap_or_default(), trial));
             }
         }
         Ok(())
@@ -197,28 +197,29 @@ impl EarlierOffers for CachedOffers {
     }
 }
 
-fn push_from(made: &mut Made, other: &Made, i: usize, kind: Kind) {
-    made.notes.extend_from_slice(&other.notes[i * kind.notes()..][..kind.notes()]);
-    made.texels.extend_from_slice(&other.texels[i * kind.texels()..][..kind.texels()]);
+fn push_from(made: &mut TrialResults, other: &TrialResults, i: usize, trial: Trial) {
+    made.notes.extend_from_slice(&other.notes[i * trial.notes()..][..trial.notes()]);
+    made.texels.extend_from_slice(&other.texels[i * trial.texels()..][..trial.texels()]);
 }
 
 impl Entry {
-    fn is_sound(&self, kind: Kind) -> bool {
-        let Made { notes, texels } = &self.made;
+    fn is_sound(&self, trial: Trial) -> bool {
+        let TrialResults { notes, texels } = &self.made;
         let count = self.places.len();
-        let is_axis = |note: &Note| match kind {
-            Kind::Plain => true,
-            Kind::Texels(KeptCodec::Bc7) => note.word <= 2,
-            Kind::Texels(_) => note.word == 2,
+        let is_axis = |note: &Note| match trial {
+            Trial::Plain => true,
+            Trial::Texels(codec) => {
+                u8::try_from(note.word).is_ok_and(|axis| codec.codec().axes().contains(&axis))
+            }
         };
         [self.actives.len(), notes.len(), texels.len()]
-            == [count, count * kind.notes(), count * kind.texels()]
+            == [count, count * trial.notes(), count * trial.texels()]
             && self.places.is_sorted_by(|a, b| a < b)
             && notes.iter().all(is_axis)
     }
 
     /// What is in either; of what is in both, this one's.
-    fn union(self, other: &Self, kind: Kind) -> Self {
+    fn union(self, other: &Self, trial: Trial) -> Self {
         let of = |entry| move |(i, &place): (usize, &u32)| (place, entry, i);
         let (own, others) = (self.places.iter().enumerate(), other.places.iter().enumerate());
         let mut all: Vec<(u32, &Self, usize)> = own.map(of(&self)).chain(others.map(of(other))).collect();
@@ -229,7 +230,7 @@ impl Entry {
         for (place, entry, i) in all {
             union.places.push(place);
             union.actives.push(entry.actives[i]);
-            push_from(&mut union.made, &entry.made, i, kind);
+            push_from(&mut union.made, &entry.made, i, trial);
         }
         union
     }

@@ -6,7 +6,8 @@ use rayon::prelude::*;
 
 use super::cached_bricks::GridCache;
 use super::{Job, Plan, Progress, memory};
-use crate::cache::{Cache, Key, Stage};
+use crate::cache::{Cache, Key, Namespace};
+use crate::codec::TexelCodec;
 use crate::error::{Error, Result};
 use crate::profile;
 use crate::settings::{Format, Masks, Settings};
@@ -20,7 +21,7 @@ use crate::volume::{Blocks, Brick, FlatFrame};
 /// What frames pass through before anything is made of them.
 pub type Alter<'a> = &'a (dyn Fn(&mut FlatFrame) + Sync);
 
-const OUTLINE: Stage = Stage { name: "outline", version: 4, travels: false };
+const OUTLINE: Namespace = Namespace { name: "outline", version: 4, travels: false };
 
 /// One grid of one frame, with its voxels unless they were not needed so far.
 type Frame = (FrameIndex, Option<Blocks<Brick>>);
@@ -202,9 +203,9 @@ pub(super) fn unknown(
 
 fn mask_policy(settings: &Settings, class: GridClass) -> MaskPolicy {
     match (settings.masks, settings.format(), class) {
-        (Masks::Keep, ..) | (Masks::Auto, Format::F32, _) | (Masks::Auto, _, GridClass::LevelSet) => {
-            MaskPolicy::Keep
-        }
+        (Masks::Keep, ..)
+        | (Masks::Auto, Format::Uniform(TexelCodec::EXACT), _)
+        | (Masks::Auto, _, GridClass::LevelSet) => MaskPolicy::Keep,
         (Masks::Auto, ..) => MaskPolicy::DropFog,
         (Masks::Drop, ..) => MaskPolicy::DropWhereBackground,
     }

@@ -21,7 +21,7 @@ pub use crate::progress::{Progress, Silent};
 use crate::report::PackSummary;
 pub use crate::report::model::Made;
 use crate::report::model::{BuildReport, StageSeconds};
-use crate::settings::{Format, Settings};
+use crate::settings::Settings;
 use crate::stages::allocate::Allocation;
 use crate::stages::metadata::{self, Digests, KnownDigests, SequenceInfo};
 use crate::stages::quantise::{GridBricks, quantise};
@@ -417,7 +417,7 @@ impl Clock {
 }
 
 fn provenance(sequence: &SequenceInfo, settings: &Settings) -> Provenance {
-    let uses_block_encoder = matches!(settings.format(), Format::Bc4 | Format::Bc7 | Format::Adaptive);
+    let uses_block_encoder = settings.codec().is_none_or(|codec| codec.codec().is_blocks());
     Provenance {
         tool: env!("CARGO_PKG_NAME").to_owned(),
         version: env!("CARGO_PKG_VERSION").to_owned(),

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::{Job, Made, VerifyLevel};
-use crate::cache::{Blob, Cache, Key, Stage};
+use crate::cache::{Blob, Cache, Key, Namespace};
 use crate::cancel::CancelToken;
 use crate::digest::digest;
 use crate::error::{Error, Result};
@@ -15,12 +15,12 @@ use crate::settings::Settings;
 use crate::stages::metadata::{Digests, KnownDigests};
 use crate::verify::VerifyReport;
 
-const PACK: Stage = Stage { name: "pack", version: 1, travels: true };
+const PACK: Namespace = Namespace { name: "pack", version: 1, travels: true };
 /// A pack whose level of zstd is not what was asked for, but all else is.
-const ANY_LEVEL: Stage = Stage { name: "pack-any-zstd", version: 1, travels: true };
-const VERIFY: Stage = Stage { name: "verify", version: 4, travels: true };
+const ANY_LEVEL: Namespace = Namespace { name: "pack-any-zstd", version: 1, travels: true };
+const VERIFY: Namespace = Namespace { name: "verify", version: 4, travels: true };
 /// A verification whose pictures were traced by the CPU alone, since no device could.
-const VERIFY_ON_CPU: Stage = Stage { name: "verify-on-cpu", version: 2, travels: true };
+const VERIFY_ON_CPU: Namespace = Namespace { name: "verify-on-cpu", version: 2, travels: true };
 
 impl KnownDigests for Cache {
     fn remembered(&self, path: &Path, stamp: &Stamp) -> Option<blake3::Hash> {

@@ -35,7 +35,7 @@ enum Cell {
 }
 
 /// How far apart GPUs interpolate, of the distance of a block's endpoints.
-const BC4_UNCERTAINTY: f32 = 0.03;
+const GPU_UNCERTAINTY: f32 = 0.03;
 
 fn span(values: &[f32]) -> f32 {
     let least = values.iter().copied().fold(f32::INFINITY, f32::min);
@@ -183,8 +183,8 @@ impl DecodedFrame {
             }
             Region::Brick(record) => match frame.decode(&record) {
                 Ok(brick) => {
-                    let is_bc4 = record.codec == Codec::Bc4;
-                    let uncertainty = if is_bc4 { BC4_UNCERTAINTY * span(&brick.values[..]) } else { 0.0 };
+                    let varies = record.codec.varies_by_gpu();
+                    let uncertainty = if varies { GPU_UNCERTAINTY * span(&brick.values[..]) } else { 0.0 };
                     field.put_brick(origin, DecodedBrick { values: brick.values, uncertainty });
                 }
                 Err(e) => result = Err(e),

@@ -62,7 +62,8 @@ pub struct Gpu {
 /// A pack on a GPU.
 pub struct Uploaded {
     tree: wgpu::Buffer,
-    textures: [wgpu::TextureView; 5],
+    /// In the order of [`Codec::WITH_TEXELS`].
+    textures: Vec<wgpu::TextureView>,
     has: Has,
 }
 
@@ -143,9 +144,9 @@ impl Gpu {
             contents: bytemuck::cast_slice(pack.tree()),
             usage: wgpu::BufferUsages::STORAGE,
         });
-        let mut views = Vec::new();
+        let mut textures = Vec::new();
         for codec in Codec::WITH_TEXELS {
-            views.push(match pack.atlas(codec) {
+            textures.push(match pack.atlas(codec) {
                 None => self.texture(wgpu::TextureFormat::R8Unorm, [1; 3]).create_view(&Default::default()),
                 Some(atlas) => {
                     if atlas.slabs > atlas.page_slabs {
@@ -166,7 +167,6 @@ impl Gpu {
                 }
             });
         }
-        let textures = views.try_into().expect("five codecs have texels");
         Ok(Uploaded { tree, textures, has: Has::of(pack) })
     }
 

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::cache::{Cache, Key, Stage};
+use crate::cache::{Cache, Key, Namespace};
 use crate::cancel::CancelToken;
 use crate::error::{Error, Result};
 use crate::pack::{Grid, Pack};
@@ -18,7 +18,7 @@ const STRIP_FRAMES: usize = 24;
 const STRIP_SIDE: u32 = 96;
 
 /// Pictures are drawn once for a pack.
-const STAGE: Stage = Stage { name: "gallery", version: 2, travels: true };
+const STAGE: Namespace = Namespace { name: "gallery", version: 2, travels: true };
 
 /// A pack's pictures.
 #[derive(Clone, Debug, Serialize, Deserialize)]

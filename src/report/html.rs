@@ -8,6 +8,7 @@ use super::chart::{ChartError, Line, frames_svg, histogram_svg};
 use super::gallery::{Gallery, Png};
 use super::markdown::arrow;
 use super::model::{AssetReport, Breach, Figures, PackReport, Report};
+use crate::codec::TexelCodec;
 use crate::units::{bytes, count, of_limit, percent, seconds};
 
 /// Why a page could not be made.
@@ -26,7 +27,7 @@ pub enum PageError {
 struct Page<'a> {
     report: &'a Report,
     verdict: String,
-    css: &'static str,
+    css: String,
     js: &'static str,
     total: Vec<Fact>,
     assets: Vec<Asset<'a>>,
@@ -117,7 +118,7 @@ pub fn html(report: &Report, galleries: &[Option<Gallery>]) -> Result<String, Pa
     let page = Page {
         report,
         verdict: verdict(report),
-        css: include_str!("templates/report.css"),
+        css: css(),
         js: include_str!("templates/report.js"),
         total: vec![
             total("On the GPU", "gpu_bytes", sums.gpu_bytes, sums.gpu_budget),
@@ -129,6 +130,15 @@ pub fn html(report: &Report, galleries: &[Option<Gallery>]) -> Result<String, Pa
         offers,
     };
     Ok(page.render()?)
+}
+
+/// The style sheet, with a colour for each codec.
+fn css() -> String {
+    let mut css = include_str!("templates/report.css").to_owned();
+    for codec in TexelCodec::ALL {
+        css += &format!(".part.{} {{ background: {}; }}\n", codec.name(), codec.color());
+    }
+    css
 }
 
 /// The page in a sentence.

@@ -76,7 +76,7 @@ impl PackSummary {
         let texel_bytes: u64 = pack.atlases().iter().map(Atlas::bytes).sum();
         let part = |part: f64, whole: f64| if whole > 0.0 { part / whole } else { 0.0 };
         for (tag, squares) in squares.into_iter().enumerate() {
-            let codec = Codec::from_tag(tag as u32).expect("there are six");
+            let codec = Codec::from_tag(tag as u32).expect("one for each codec");
             if squares > 0.0 || codecs.contains_key(codec.name()) {
                 let entry = codecs.entry(codec.name()).or_default();
                 entry.share_of_bytes = part(entry.bytes as f64, texel_bytes as f64);
@@ -115,8 +115,8 @@ impl PackSummary {
 }
 
 /// What each codec cost, by tag, in squared ranges of each grid's active values.
-fn squares_by_codec(pack: &Pack) -> [f64; 6] {
-    let mut squares = [0.0; 6];
+fn squares_by_codec(pack: &Pack) -> [f64; Codec::COUNT] {
+    let mut squares = [0.0; Codec::COUNT];
     for grid in pack.grids() {
         let peak = grid.peak();
         for (sum, error_l2) in squares.iter_mut().zip(grid.record.codec_error_l2s) {

@@ -6,7 +6,7 @@ use serde::{Deserialize, Deserializer};
 use super::quality::{check_above_zero, check_decibels, decibels};
 use super::{
     ByteSize, Clustering, DEFAULT_ZSTD, Dedup, Encoding, ErrorBound, Format, Integers, Masks, NonFinite,
-    Quality, RangeMode, Settings, UniformCodec, above_zero, whole_range,
+    Quality, RangeMode, Settings, TexelCodec, above_zero, whole_range,
 };
 
 /// How a pack is made. The names of fields are the keys of a manifest; what is said of them is the help.
@@ -90,7 +90,7 @@ impl SettingsArgs {
     pub fn settings(&self) -> Result<Settings, String> {
         Ok(Settings {
             grids: self.grids.clone().unwrap_or_default(),
-            encoding: match self.format.unwrap_or_default().uniform_codec() {
+            encoding: match self.format.unwrap_or_default().codec() {
                 None => self.adaptive()?,
                 Some(codec) => self.uniform(codec)?,
             },
@@ -115,12 +115,12 @@ impl SettingsArgs {
         Ok(Encoding::Adaptive { quality, min_frame_psnr: self.min_frame_psnr })
     }
 
-    fn uniform(&self, codec: UniformCodec) -> Result<Encoding, String> {
+    fn uniform(&self, codec: TexelCodec) -> Result<Encoding, String> {
         let numbers = [self.psnr, self.bits_per_voxel, self.min_frame_psnr];
         if numbers.iter().any(Option::is_some) || self.max_error.is_some() || self.size.is_some() {
             return Err(format!(
                 "psnr, max_error, bits_per_voxel, size and min_frame_psnr are for the adaptive format, not for {}",
-                codec.format().name()
+                codec.name()
             ));
         }
         Ok(Encoding::Uniform { codec, clustering: self.clustering()? })

@@ -57,7 +57,7 @@ impl TryFrom<Document> for Settings {
 
     fn try_from(document: Document) -> Result<Self, Self::Error> {
         let Document { quality, min_frame_psnr, clustering, .. } = document;
-        let encoding = match (document.format.uniform_codec(), min_frame_psnr, clustering) {
+        let encoding = match (document.format.codec(), min_frame_psnr, clustering) {
             (None, _, None) => Encoding::Adaptive { quality, min_frame_psnr },
             (None, _, Some(_)) => return Err("clustering with the adaptive format"),
             // Its quality was never asked for: it is the default of the version that built the pack, and is not used.
@@ -80,7 +80,7 @@ impl TryFrom<Document> for Settings {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::settings::{ErrorBound, UniformCodec};
+    use crate::settings::{ErrorBound, TexelCodec};
 
     /// As packs had it when [`Settings`] had these fields themselves.
     fn json(grids: &str, format: &str, quality: &str, floor: &str, clustering: &str, rest: &str) -> String {
@@ -127,14 +127,14 @@ mod tests {
             ),
             (
                 Settings {
-                    encoding: Encoding::Uniform { codec: UniformCodec::Bc7, clustering },
+                    encoding: Encoding::Uniform { codec: TexelCodec::BC7, clustering },
                     ..adaptive(psnr, None)
                 },
                 json(density, "bc7", BY_CLASS, none, clusters, REST),
             ),
             (
                 Settings {
-                    encoding: UniformCodec::Unorm8.into(),
+                    encoding: TexelCodec::UNORM8.into(),
                     range: RangeMode::Sequence,
                     ..adaptive(psnr, None)
                 },
@@ -143,7 +143,7 @@ mod tests {
             (
                 Settings {
                     grids: Vec::new(),
-                    encoding: UniformCodec::F32.into(),
+                    encoding: TexelCodec::F32.into(),
                     range: RangeMode::Brick,
                     masks: Masks::Drop,
                     nonfinite: NonFinite::Zero,
@@ -167,11 +167,8 @@ mod tests {
         let floor = read(r#"{"format":"bc4","min_frame_psnr":30.0}"#).unwrap_err();
         assert!(floor.starts_with("min_frame_psnr without the adaptive format"), "{floor}");
         // The default of an earlier version.
-        let bc4 = Settings {
-            encoding: UniformCodec::Bc4.into(),
-            integers: Integers::Nearest,
-            ..Settings::default()
-        };
+        let bc4 =
+            Settings { encoding: TexelCodec::BC4.into(), integers: Integers::Nearest, ..Settings::default() };
         assert_eq!(read(r#"{"format":"bc4","quality":{"psnr":45.0}}"#), Ok(bc4));
     }
 }

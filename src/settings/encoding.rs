@@ -1,10 +1,13 @@
 //! How bricks are stored: adaptively or all by one codec, each with the settings that go with it.
 
+use std::borrow::Cow;
+
 use clap::ValueEnum;
-use serde::{Deserialize, Serialize};
+use clap::builder::PossibleValue;
+use serde::{Deserialize, Deserializer, Serialize, Serializer, de::Error};
 
 use super::{Clustering, Quality};
-use crate::codec::Codec;
+use crate::codec::TexelCodec;
 
 /// How the bricks of a pack are stored.
 #[derive(Clone, Debug, PartialEq)]
@@ -19,7 +22,7 @@ pub enum Encoding {
     /// One codec for every brick that is not constant.
     Uniform {
         /// The codec.
-        codec: UniformCodec,
+        codec: TexelCodec,
         /// How similar bricks are clustered; none for not at all.
         clustering: Option<Clustering>,
     },
@@ -38,9 +41,9 @@ impl From<Quality> for Encoding {
     }
 }
 
-impl From<UniformCodec> for Encoding {
+impl From<TexelCodec> for Encoding {
     /// One codec, without clusters.
-    fn from(codec: UniformCodec) -> Self {
+    fn from(codec: TexelCodec) -> Self {
         Self::Uniform { codec, clustering: None }
     }
 }
@@ -48,91 +51,94 @@ impl From<UniformCodec> for Encoding {
 impl From<Format> for Encoding {
     /// A format with its defaults.
     fn from(format: Format) -> Self {
-        format.uniform_codec().map_or_else(Self::default, Self::from)
-    }
-}
-
-/// A codec that all bricks of a pack can have: one that has texels.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum UniformCodec {
-    /// Floats.
-    F32,
-    /// Half floats.
-    F16,
-    /// One byte a voxel.
-    Unorm8,
-    /// BC4 blocks.
-    Bc4,
-    /// BC7 blocks.
-    Bc7,
-}
-
-impl UniformCodec {
-    /// As one of all codecs.
-    pub fn codec(self) -> Codec {
-        match self {
-            Self::F32 => Codec::F32,
-            Self::F16 => Codec::F16,
-            Self::Unorm8 => Codec::Unorm8,
-            Self::Bc4 => Codec::Bc4,
-            Self::Bc7 => Codec::Bc7,
-        }
-    }
-
-    /// As manifests have it.
-    pub fn format(self) -> Format {
-        match self {
-            Self::F32 => Format::F32,
-            Self::F16 => Format::F16,
-            Self::Unorm8 => Format::Unorm8,
-            Self::Bc4 => Format::Bc4,
-            Self::Bc7 => Format::Bc7,
-        }
+        format.codec().map_or_else(Self::default, Self::from)
     }
 }
 
 /// The kind of [`Encoding`], as manifests, the command line and reports name it.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize, ValueEnum)]
-#[serde(rename_all = "lowercase")]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Format {
-    /// The cheapest codec for each brick at the quality asked
+    /// The cheapest codec for each brick at the quality asked.
     #[default]
     Adaptive,
-    /// 32-bit floats, lossless
-    F32,
-    /// 16-bit floats, exact where the source is half
-    F16,
-    /// 8 bits per voxel
-    Unorm8,
-    /// BC4 blocks, 4 bits per voxel
-    Bc4,
-    /// BC7 blocks, 2 bits per voxel
-    Bc7,
+    /// One codec for every brick that is not constant.
+    Uniform(TexelCodec),
 }
 
 impl Format {
+    /// All bricks in [`TexelCodec::F32`].
+    pub const F32: Self = Self::Uniform(TexelCodec::F32);
+    /// All bricks in [`TexelCodec::F16`].
+    pub const F16: Self = Self::Uniform(TexelCodec::F16);
+    /// All bricks in [`TexelCodec::UNORM8`].
+    pub const UNORM8: Self = Self::Uniform(TexelCodec::UNORM8);
+    /// All bricks in [`TexelCodec::BC4`].
+    pub const BC4: Self = Self::Uniform(TexelCodec::BC4);
+    /// All bricks in [`TexelCodec::BC7`].
+    pub const BC7: Self = Self::Uniform(TexelCodec::BC7);
+
+    /// Every format: the adaptive one, then those of one codec, finest first.
+    pub const ALL: [Self; 1 + TexelCodec::ALL.len()] = {
+        let mut all = [Self::Adaptive; 1 + TexelCodec::ALL.len()];
+        let mut i = 0;
+        while i < TexelCodec::ALL.len() {
+            all[TexelCodec::ALL.len() - i] = Self::Uniform(TexelCodec::ALL[i]);
+            i += 1;
+        }
+        all
+    };
+
+    const NAMES: [&str; Self::ALL.len()] = {
+        let mut names = [""; Self::ALL.len()];
+        let mut i = 0;
+        while i < names.len() {
+            names[i] = Self::ALL[i].name();
+            i += 1;
+        }
+        names
+    };
+
     /// The codec of every brick that is not constant; none where each brick has its own.
-    pub fn uniform_codec(self) -> Option<UniformCodec> {
+    pub fn codec(self) -> Option<TexelCodec> {
         match self {
             Self::Adaptive => None,
-            Self::F32 => Some(UniformCodec::F32),
-            Self::F16 => Some(UniformCodec::F16),
-            Self::Unorm8 => Some(UniformCodec::Unorm8),
-            Self::Bc4 => Some(UniformCodec::Bc4),
-            Self::Bc7 => Some(UniformCodec::Bc7),
+            Self::Uniform(codec) => Some(codec),
         }
     }
 
-    /// The same as one of all codecs.
-    pub fn codec(self) -> Option<Codec> {
-        self.uniform_codec().map(UniformCodec::codec)
-    }
-
     /// Its name in manifests and reports.
-    pub fn name(self) -> &'static str {
-        self.codec().map_or("adaptive", Codec::name)
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Adaptive => "adaptive",
+            Self::Uniform(codec) => codec.name(),
+        }
+    }
+}
+
+impl ValueEnum for Format {
+    fn value_variants<'a>() -> &'a [Self] {
+        &Self::ALL
     }
 
-    /// Every format: those of one codec, finest first, then the adaptive one.
-    pub const ALL: [Self; 6] = [Self::F32, Self::F16, Self::Unorm8, Self::Bc4, Self::Bc7, Self::Adaptive];
+    fn to_possible_value(&self) -> Option<PossibleValue> {
+        let help = match self {
+            Self::Adaptive => "The cheapest codec for each brick at the quality asked",
+            Self::Uniform(codec) => codec.help(),
+        };
+        Some(PossibleValue::new(self.name()).help(help))
+    }
+}
+
+impl Serialize for Format {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.name())
+    }
+}
+
+impl<'de> Deserialize<'de> for Format {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let name = Cow::<str>::deserialize(deserializer)?;
+        let format = Self::ALL.into_iter().find(|format| format.name() == name);
+        format.ok_or_else(|| D::Error::unknown_variant(&name, &Self::NAMES))
+    }
 }

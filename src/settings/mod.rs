@@ -10,14 +10,14 @@ mod quality;
 use clap::ValueEnum;
 use serde::{Deserialize, Serialize};
 
+pub use crate::codec::TexelCodec;
 pub use args::SettingsArgs;
 pub use budget::{Budget, Share};
 pub use clustering::{Clustering, Dedup};
-pub use encoding::{Encoding, Format, UniformCodec};
+pub use encoding::{Encoding, Format};
 pub(crate) use quality::check_above_zero;
 pub use quality::{ByteSize, ErrorBound, FRAME_MARGIN_DB, Quality, above_zero, whole_range};
 
-use crate::codec::Codec;
 use document::Document;
 
 /// What the 0 and 1 of normalised texels stand for.
@@ -114,7 +114,7 @@ impl Settings {
     pub fn format(&self) -> Format {
         match self.encoding {
             Encoding::Adaptive { .. } => Format::Adaptive,
-            Encoding::Uniform { codec, .. } => codec.format(),
+            Encoding::Uniform { codec, .. } => Format::Uniform(codec),
         }
     }
 
@@ -124,7 +124,7 @@ impl Settings {
     }
 
     /// The codec of every brick that is not constant, where there is one for all.
-    pub fn codec(&self) -> Option<Codec> {
+    pub fn codec(&self) -> Option<TexelCodec> {
         self.format().codec()
     }
 

@@ -4,10 +4,10 @@ use rayon::prelude::*;
 
 use super::allocate::{Allocation, BrickErrors, Coding};
 use super::dedup::SequenceTree;
-use super::encoder_cache::{EncoderCache, KeptCodec, Kind, Tried};
+use super::encoder_cache::{EncoderCache, KeptBricks, Trial};
 use super::relayout::{self, Cursor, Placement, Texture, TextureOf};
 use crate::cancel::CancelToken;
-use crate::codec::{self, Codec, OutOfRange, Texels, decode, encode};
+use crate::codec::{EncodedBricks, Fidelity, OutOfRange, TexelCodec, Texels, decode, encode};
 use crate::error::{Error, Result};
 use crate::pack::Atlas;
 use crate::profile;
@@ -67,9 +67,9 @@ impl EncodedGrid {
     }
 }
 
-/// Some texels, encoded.
+/// The texels of a slab, or of a part of it.
 #[derive(Default)]
-struct Encoded {
+struct SlabTexels {
     /// One brick's after another's.
     bytes: Vec<u8>,
     axes: Vec<u8>,
@@ -112,20 +112,20 @@ pub fn quantise<T: Send>(
         };
         // Some a thread: one of them may take longer than another.
         let group: Vec<Slab> =
-            slabs.by_ref().take(AT_ONCE * rayon::current_num_threads()).map(slab).collect();
+            slabs.by_ref().take(SLABS_PER_THREAD * rayon::current_num_threads()).map(slab).collect();
         if group.is_empty() {
             break;
         }
         for slabs in group.chunk_by(|a, b| a.atlas.codec == b.atlas.codec) {
             let textures: Vec<Texture> = slabs.iter().flat_map(|slab| &slab.textures).copied().collect();
-            prepare(grids, slabs[0].atlas.codec, &textures)?;
+            prepare(grids, codec(slabs[0].atlas), &textures)?;
         }
         let shared = &*grids;
         let encoded: Vec<_> = group
             .par_iter()
             .map(|slab| {
                 let _span = profile::span("quantise");
-                let Encoded { bytes, axes, error_l2s } = encode_slab(shared, slab)?;
+                let SlabTexels { bytes, axes, error_l2s } = encode_slab(shared, slab)?;
                 Ok((finish(slab.atlas, relayout::assemble(slab.atlas, &bytes))?, axes, error_l2s))
             })
             .collect::<Result<_>>()?;
@@ -146,40 +146,45 @@ pub fn quantise<T: Send>(
 }
 
 /// Slabs that are worked on together, for each thread.
-const AT_ONCE: usize = 2;
+const SLABS_PER_THREAD: usize = 2;
+
+/// The codec of an atlas.
+fn codec(atlas: &Atlas) -> TexelCodec {
+    TexelCodec::of(atlas.codec).expect("an atlas has texels")
+}
 
 /// Sees to it that the texels of some slots, which are kept, or else their bricks can be read.
-fn prepare(grids: &mut [GridBricks], codec: Codec, textures: &[Texture]) -> Result<()> {
+fn prepare(grids: &mut [GridBricks], codec: TexelCodec, textures: &[Texture]) -> Result<()> {
     for (g, GridBricks { tree, encoders, .. }) in grids.iter_mut().enumerate() {
         let own = textures.iter().filter(|texture| texture.grid as usize == g).filter_map(Texture::brick);
         let ids: Vec<u32> = own.collect();
-        match KeptCodec::of(codec) {
-            Some(kept) => encoders.make(tree, &ids, &[Kind::Texels(kept)], |_| ())?,
-            None => tree.fetch(&ids)?,
+        match codec.keeps_texels() {
+            true => encoders.make(tree, &ids, &[Trial::Texels(codec)], |_| ())?,
+            false => tree.fetch(&ids)?,
         }
     }
     Ok(())
 }
 
-fn encode_slab(grids: &[GridBricks], slab: &Slab) -> Result<Encoded> {
-    let codec = slab.atlas.codec;
+fn encode_slab(grids: &[GridBricks], slab: &Slab) -> Result<SlabTexels> {
+    let codec = codec(slab.atlas);
     let together = |a: &Texture, b: &Texture| a.grid == b.grid && a.brick().is_some() && b.brick().is_some();
-    let mut all = Encoded::default();
+    let mut all = SlabTexels::default();
     for run in slab.textures.chunk_by(together) {
         let grid = run[0].grid as usize;
         let GridBricks { name, tree, allocation, encoders } = &grids[grid];
         if let TextureOf::Shape(shape) = run[0].of {
             let shape = &allocation.shapes[shape as usize];
-            all.add(Encoded { bytes: shape.bytes.clone(), axes: vec![shape.axis], error_l2s: vec![0.0] });
+            all.add(SlabTexels { bytes: shape.bytes.clone(), axes: vec![shape.axis], error_l2s: vec![0.0] });
             continue;
         }
         let ids: Vec<u32> = run.iter().filter_map(Texture::brick).collect();
-        all.add(match KeptCodec::of(codec) {
-            Some(kept) => {
-                let Tried { costs, bytes, axes } = encoders.texels(&ids, kept)?;
-                Encoded { bytes, axes, error_l2s: costs.iter().map(|cost| cost.error_l2).collect() }
+        all.add(match codec.keeps_texels() {
+            true => {
+                let KeptBricks { costs, bytes, axes } = encoders.texels(&ids, codec)?;
+                SlabTexels { bytes, axes, error_l2s: costs.iter().map(|cost| cost.error_l2).collect() }
             }
-            None => {
+            false => {
                 let bricks = tree.pool.read(&ids)?;
                 let encoded = encode_bricks(codec, &grids[grid], &ids, &bricks);
                 encoded.map_err(|source| Error::OutOfRange { grid: (*name).to_owned(), source })?
@@ -189,7 +194,7 @@ fn encode_slab(grids: &[GridBricks], slab: &Slab) -> Result<Encoded> {
     Ok(all)
 }
 
-impl Encoded {
+impl SlabTexels {
     /// Appends what comes after. What is alone, as most is, is not copied.
     fn add(&mut self, next: Self) {
         if self.axes.is_empty() {
@@ -203,23 +208,25 @@ impl Encoded {
 }
 
 fn encode_bricks(
-    codec: Codec,
+    codec: TexelCodec,
     grid: &GridBricks,
     ids: &[u32],
     bricks: &[Brick],
-) -> Result<Encoded, OutOfRange> {
+) -> Result<SlabTexels, OutOfRange> {
     let sequence = &grid.allocation.sequence;
     let texels: Vec<Texels> =
         ids.iter().zip(bricks).map(|(&id, brick)| grid.encoders.prepare(grid.tree, id, brick)).collect();
-    let codec::Encoded { bytes, axes } = encode(codec, sequence, &texels)?;
+    let EncodedBricks { bytes, axes } = encode(codec, sequence, &texels)?;
+    let codec = codec.codec();
     let each = bricks.iter().zip(&texels).zip(bytes.chunks_exact(codec.layout().brick_bytes())).zip(&axes);
-    let error_l2 = |(((brick, texels), bytes), &axis): (((&Brick, &Texels), &[u8]), &u8)| match codec {
-        Codec::F32 => 0.0,
-        _ => {
-            let decoded = decode(codec, bytes, axis, sequence, texels.range);
-            brick.error_l2(&decoded, &texels.texel_mask)
-        }
-    };
+    let error_l2 =
+        |(((brick, texels), bytes), &axis): (((&Brick, &Texels), &[u8]), &u8)| match codec.fidelity() {
+            Fidelity::Exact => 0.0,
+            _ => {
+                let decoded = decode(codec, bytes, axis, sequence, texels.range);
+                brick.error_l2(&decoded, &texels.texel_mask)
+            }
+        };
     let error_l2s = each.map(error_l2).collect();
-    Ok(Encoded { bytes, axes, error_l2s })
+    Ok(SlabTexels { bytes, axes, error_l2s })
 }

@@ -52,7 +52,7 @@ pub struct Cursor {
 /// Gives each brick its place: in the order of the pools, which is that of first use, so that a frame needs few
 /// slabs. Texels that several bricks read lie where the first of those would.
 pub fn place(allocations: &[&Allocation]) -> Placement {
-    let mut counts = [0; Codec::WITH_TEXELS.len() + 1];
+    let mut counts = [0; Codec::COUNT];
     let slots = allocations.iter().map(|allocation| slots(allocation, &mut counts)).collect();
     let planned = Codec::WITH_TEXELS.into_iter().map(|codec| plan(codec, counts[codec as usize]));
     Placement { atlases: planned.filter(|atlas| atlas.bricks > 0).collect(), slots }

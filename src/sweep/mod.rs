@@ -16,7 +16,7 @@ use crate::error::{Error, Result};
 use crate::pipeline::{Job, Progress, VerifyLevel};
 use crate::report::chart::{self, Point, Spread};
 use crate::settings::{
-    Clustering, Encoding, ErrorBound, Format, Integers, NonFinite, Quality, RangeMode, Settings, UniformCodec,
+    Clustering, Encoding, ErrorBound, Format, Integers, NonFinite, Quality, RangeMode, Settings, TexelCodec,
 };
 
 pub use cheaper::cheaper;
@@ -132,7 +132,7 @@ impl Options {
 
     fn clustered(&self, (clusters, iterations, variance): (u32, u32, f64), seed: u64) -> Method {
         let clustering = Some(Clustering { clusters, iterations, variance, seed });
-        let settings = self.settings(Encoding::Uniform { codec: UniformCodec::Bc7, clustering });
+        let settings = self.settings(Encoding::Uniform { codec: TexelCodec::BC7, clustering });
         Method {
             method: "kmeans",
             // The thesis's three columns.
@@ -149,10 +149,10 @@ impl Options {
         methods.extend(
             [0.02, 0.01, 0.005, 0.001].map(|e| self.adaptive(Quality::MaxError(ErrorBound::of_range(e)))),
         );
-        methods.extend(
-            [Format::F32, Format::F16, Format::Unorm8, Format::Bc4, Format::Bc7].map(|f| self.uniform(f)),
-        );
-        methods.extend([Format::Unorm8, Format::Bc4, Format::Bc7].map(|f| self.sequence_range(f)));
+        let uniform = || Format::ALL.into_iter().filter(|format| format.codec().is_some());
+        let is_normalised = |format: &Format| format.codec().is_some_and(|c| c.codec().is_normalised());
+        methods.extend(uniform().map(|format| self.uniform(format)));
+        methods.extend(uniform().filter(is_normalised).map(|format| self.sequence_range(format)));
         methods.extend(CLUSTERINGS.map(|c| self.clustered(c, 0)));
         methods
     }
@@ -164,10 +164,10 @@ impl Options {
             self.adaptive(Quality::Psnr(45.0)),
             self.adaptive(Quality::default()),
             self.adaptive(Quality::MaxError(ErrorBound::of_range(0.01))),
-            self.uniform(Format::Unorm8),
-            self.sequence_range(Format::Unorm8),
-            self.uniform(Format::Bc4),
-            self.uniform(Format::Bc7),
+            self.uniform(Format::UNORM8),
+            self.sequence_range(Format::UNORM8),
+            self.uniform(Format::BC4),
+            self.uniform(Format::BC7),
             self.clustered((100, 5, 0.01), 0),
             self.clustered((1000, 5, 0.1), 0),
             self.clustered((100, 5, 0.1), 0),

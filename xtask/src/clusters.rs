@@ -7,7 +7,7 @@ use serde_json::json;
 use volpack::codec::Codec;
 use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
-use volpack::settings::{Clustering, Encoding, Settings, UniformCodec};
+use volpack::settings::{Clustering, Encoding, Settings, TexelCodec};
 
 use crate::{peer_programs, sequence};
 
@@ -48,7 +48,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 frames.clone(),
                 folder.path().join("bench.volpack"),
                 Settings {
-                    encoding: Encoding::Uniform { codec: UniformCodec::Bc7, clustering },
+                    encoding: Encoding::Uniform { codec: TexelCodec::BC7, clustering },
                     ..Settings::default()
                 },
                 VerifyLevel::Voxels,

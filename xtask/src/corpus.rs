@@ -222,8 +222,8 @@ fn end(job: &Job, grid: &Grid) -> End {
 fn reason(job: &Job, grid: &Grid, why: &str) -> Option<&'static str> {
     let format = job.settings.format();
     let is_uniform = format.codec().is_some();
-    let is_blocks = matches!(format, Format::Bc4 | Format::Bc7);
-    let is_bytes = is_blocks || format == Format::Unorm8;
+    let is_blocks = matches!(format, Format::BC4 | Format::BC7);
+    let is_bytes = is_blocks || format == Format::UNORM8;
     let asks_for_bytes = job.settings.quality().is_size() && !is_uniform;
     let list = [
         (

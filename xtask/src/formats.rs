@@ -5,7 +5,6 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use serde_json::json;
-use volpack::codec::Codec;
 use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::report::PackSummary;
@@ -73,7 +72,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
                 grid.active.psnr.map_or("exact".to_owned(), |db| format!("{db:.2}")),
                 grid.active.max_error / grid.peak,
             );
-            if way.settings.format() == Format::Unorm8 && way.range == Some(RangeMode::Brick) {
+            if way.settings.format() == Format::UNORM8 && way.range == Some(RangeMode::Brick) {
                 print_tree(name, &pack);
             }
             rows.push(json!({ "volume": name, "format": way.name, "range": range, "seconds": seconds, "pack": pack,
@@ -92,7 +91,7 @@ fn ways() -> Vec<Way> {
         ways.push(Way { name: name.to_owned(), range: None, settings });
     }
     for format in Format::ALL.into_iter().filter(|format| *format != Format::Adaptive) {
-        let is_normalised = format.codec().is_some_and(Codec::is_normalised);
+        let is_normalised = format.codec().is_some_and(|codec| codec.codec().is_normalised());
         for range in [RangeMode::Brick, RangeMode::Sequence] {
             if is_normalised || range == RangeMode::Brick {
                 let settings = Settings { encoding: format.into(), range, ..Settings::default() };

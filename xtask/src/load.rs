@@ -42,7 +42,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
         "| format | frames | file MB | GPU MB | whole pack ms | GB/s of GPU bytes | open ms | one more frame ms | its .vdb ms |"
     );
     println!("|---|---|---|---|---|---|---|---|---|");
-    for format in [Format::Adaptive, Format::Bc7, Format::Unorm8, Format::F16] {
+    for format in [Format::Adaptive, Format::BC7, Format::UNORM8, Format::F16] {
         for frames in [short, &long[..]] {
             let path = folder.path().join("bench.volpack");
             let encoding = match format {

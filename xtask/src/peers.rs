@@ -8,7 +8,7 @@ use std::time::Instant;
 use intel_tex_2::RgbaSurface;
 use rayon::prelude::*;
 use serde_json::{Value as Json, json};
-use volpack::codec::{BATCH, BrickRange, Codec, SequenceRange, Texels, encode};
+use volpack::codec::{BATCH, BrickRange, SequenceRange, TexelCodec, Texels, encode};
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::settings::{Format, Quality, Settings};
 use volpack::sweep::nanovdb::{self, Quantise};
@@ -136,7 +136,7 @@ type Psnrs = (f64, Vec<Option<f64>>);
 /// Builds with each of our formats and returns the PSNRs.
 fn our_psnrs(args: &Args, files: &[PathBuf], pack: &Path) -> Result<Psnrs, Box<dyn Error>> {
     let (mut peak, mut psnrs) = (0.0, Vec::new());
-    for format in [Format::F16, Format::Unorm8, Format::Adaptive] {
+    for format in [Format::F16, Format::UNORM8, Format::Adaptive] {
         let encoding = match format {
             Format::Adaptive => Quality::Psnr(45.0).into(),
             uniform => uniform.into(),
@@ -222,7 +222,7 @@ fn blocks(files: &[PathBuf], args: &Args) -> Result<Json, Box<dyn Error>> {
             .sum();
         raw.push(start.elapsed().as_secs_f64());
         let start = Instant::now();
-        let encoded = encode(Codec::Bc7, &sequence, &bricks)?;
+        let encoded = encode(TexelCodec::BC7, &sequence, &bricks)?;
         ours.push(start.elapsed().as_secs_f64());
         // Each of the three axes has as many blocks as the chosen one.
         assert!(blocks >= 3 * encoded.bytes.len(), "both sides encode the same texels");

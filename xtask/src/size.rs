@@ -42,7 +42,7 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
     println!("|---|---|---|---|---|---|---|---|---|");
     for file in &args.files {
         let name = file.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        let bc7 = pack(file, args, Format::Bc7.into(), folder.path())?;
+        let bc7 = pack(file, args, Format::BC7.into(), folder.path())?;
         for &target in &args.psnr {
             let (tolerance, theirs, error) = fpn(file, args, target, bc7.peak, folder.path())?;
             let psnr = error.psnr(bc7.peak).ok_or("a lossy grid")?;

@@ -1,7 +1,10 @@
 //! zstd: the C library, or a decoder in Rust where there is no C.
 
 /// Decodes `stored`, which has to be exactly one zstd frame of at most `raw_bytes` bytes (rule 16). No more than about
-/// three times `raw_bytes` is in memory at a time.
+/// three times `raw_bytes` and 13 MB for tables is in memory at a time.
+///
+/// Both decoders give the same bytes for frames that an encoder made. Of forged ones each refuses some that the other
+/// takes, and a few decode differently: ruzstd checks the lengths of Huffman streams in sum only.
 ///
 /// # Errors
 /// What is wrong, to put behind "does not unpack: ".
@@ -131,16 +134,15 @@ mod tests {
     }
 
     #[test]
-    fn damaged_frames_are_errors_in_both_or_the_same_bytes() {
+    fn damaged_frames_are_errors_or_no_longer_than_allowed() {
         let raw: Vec<u8> = (0..50_000u32).map(|i| (i.wrapping_mul(i) >> 9) as u8 & 0x3f).collect();
         let packed = zstd::bulk::compress(&raw, 3).unwrap();
         for at in (0..packed.len()).step_by(packed.len() / 400 + 1) {
             for flip in [1, 0x80] {
                 let mut broken = packed.clone();
                 broken[at] ^= flip;
-                let [c, rust] = BOTH.map(|decode| decode(&broken, raw.len()));
-                if let (Ok(c), Ok(rust)) = (c, rust) {
-                    assert!(c == rust, "byte {at} ^ {flip}");
+                for decoded in BOTH.map(|decode| decode(&broken, raw.len())) {
+                    assert!(decoded.map_or(0, |bytes| bytes.len()) <= raw.len(), "byte {at} ^ {flip}");
                 }
             }
         }

@@ -1,9 +1,10 @@
 //! A pipeline for each thing that the tracer does, made when it is first asked for.
 //!
-//! One shader for every mode, codec and kind of grid takes registers and branches for all of them:
+//! One shader for every mode, codec and key of grid takes registers and branches for all of them:
 //! `docs/decisions/0013-tracer-speed.md` has what that costs.
 
 use std::collections::HashMap;
+use std::fmt::Write;
 use std::sync::{Mutex, PoisonError};
 
 use super::{TRACER_WGSL, VOLPACK_WGSL};
@@ -32,7 +33,7 @@ impl Has {
 }
 
 #[derive(Clone, Copy, PartialEq, Eq, Hash)]
-struct Kind {
+struct PipelineKey {
     mode: u32,
     hdda: bool,
     level_set: bool,
@@ -49,7 +50,7 @@ pub struct Pipelines {
     module: wgpu::ShaderModule,
     bindings: wgpu::BindGroupLayout,
     layout: wgpu::PipelineLayout,
-    made: Mutex<HashMap<Kind, wgpu::ComputePipeline>>,
+    made: Mutex<HashMap<PipelineKey, wgpu::ComputePipeline>>,
 }
 
 impl Pipelines {
@@ -57,7 +58,9 @@ impl Pipelines {
     pub fn new(device: &wgpu::Device) -> Self {
         let shader = wgpu::ShaderModuleDescriptor {
             label: Some("volpack + tracer"),
-            source: wgpu::ShaderSource::Wgsl(format!("{VOLPACK_WGSL}\n{TRACER_WGSL}").into()),
+            source: wgpu::ShaderSource::Wgsl(
+                format!("{VOLPACK_WGSL}\n{TRACER_WGSL}\n{}", texels_wgsl()).into(),
+            ),
         };
         // What wgpu adds to loops, to keep foreign shaders from running for ever, costs this one a sixth
         // of its time. Every access to memory stays checked.
@@ -82,7 +85,7 @@ impl Pipelines {
 
     /// The pipeline that traces a scene from a pack.
     pub fn get(&self, device: &wgpu::Device, has: Has, scene: &Scene) -> wgpu::ComputePipeline {
-        let kind = Kind {
+        let key = PipelineKey {
             mode: scene.mode as u32,
             hdda: scene.traversal == Traversal::Hdda,
             level_set: scene.level_set,
@@ -90,10 +93,10 @@ impl Pipelines {
             has,
         };
         let mut made = self.made.lock().unwrap_or_else(PoisonError::into_inner);
-        made.entry(kind).or_insert_with(|| self.make(device, kind)).clone()
+        made.entry(key).or_insert_with(|| self.make(device, key)).clone()
     }
 
-    fn make(&self, device: &wgpu::Device, kind: Kind) -> wgpu::ComputePipeline {
+    fn make(&self, device: &wgpu::Device, key: PipelineKey) -> wgpu::ComputePipeline {
         device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
             label: Some("tracer"),
             layout: Some(&self.layout),
@@ -101,12 +104,12 @@ impl Pipelines {
             entry_point: Some("main"),
             compilation_options: wgpu::PipelineCompilationOptions {
                 constants: &[
-                    ("MODE", kind.mode.into()),
-                    ("HDDA", kind.hdda.into()),
-                    ("LEVEL_SET", kind.level_set.into()),
-                    ("TRILINEAR", kind.trilinear.into()),
-                    ("VP_CODECS", kind.has.codecs.into()),
-                    ("VP_MASKS", kind.has.masks.into()),
+                    ("MODE", key.mode.into()),
+                    ("HDDA", key.hdda.into()),
+                    ("LEVEL_SET", key.level_set.into()),
+                    ("TRILINEAR", key.trilinear.into()),
+                    ("VP_CODECS", key.has.codecs.into()),
+                    ("VP_MASKS", key.has.masks.into()),
                 ],
                 ..Default::default()
             },
@@ -133,8 +136,30 @@ fn bindings(device: &wgpu::Device) -> wgpu::BindGroupLayout {
         entry(1, buffer(wgpu::BufferBindingType::Storage { read_only: true })),
         entry(2, buffer(wgpu::BufferBindingType::Storage { read_only: false })),
     ];
-    entries.extend((3..8).map(|binding| entry(binding, texture)));
+    let texture_bindings = (FIRST_TEXTURE..).take(Codec::WITH_TEXELS.len());
+    entries.extend(texture_bindings.map(|binding| entry(binding, texture)));
     device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: None, entries: &entries })
+}
+
+/// The binding of the first codec's texture.
+const FIRST_TEXTURE: u32 = 3;
+
+/// The codecs' textures, and what reads them for `volpack.wgsl`. One page a codec is bound here; an engine with more
+/// chooses by page.
+fn texels_wgsl() -> String {
+    let (mut textures, mut reads) = (String::new(), String::new());
+    for (codec, binding) in Codec::WITH_TEXELS.into_iter().zip(FIRST_TEXTURE..) {
+        let (name, tag) = (codec.name(), codec as u32);
+        // The last read needs no question.
+        let is_it = match tag as usize == Codec::WITH_TEXELS.len() {
+            true => String::new(),
+            false => format!("if (VP_CODECS & {}u) != 0u && codec == {tag}u ", 1 << tag),
+        };
+        // Writing to a string does not fail.
+        let _ = writeln!(textures, "@group(0) @binding({binding}) var {name}_texels: texture_3d<f32>;");
+        let _ = writeln!(reads, "    {is_it}{{ return textureLoad({name}_texels, p, 0); }}");
+    }
+    format!("{textures}\nfn vp_texel(codec: u32, page: u32, p: vec3i) -> vec4f {{\n{reads}}}\n")
 }
 
 const _: () = {
@@ -142,3 +167,16 @@ const _: () = {
     assert!(Mode::Bricks as u32 == 3 && Mode::Steps as u32 == 4 && Mode::Nodes as u32 == 5);
     assert!(Mode::Normals as u32 == 6 && Mode::Lit as u32 == 7);
 };
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_shader_knows_which_codecs_are_normalised() {
+        let normalised = Codec::WITH_TEXELS.into_iter().filter(|codec| codec.is_normalised());
+        let bits: u32 = normalised.map(|codec| 1 << codec as u32).sum();
+        let line = format!("const VP_NORMALISED = {bits}u;");
+        assert!(VOLPACK_WGSL.contains(&line), "volpack.wgsl should have `{line}`");
+    }
+}

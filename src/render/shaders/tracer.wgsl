@@ -33,23 +33,10 @@ override TRILINEAR: bool = true;     // of level sets: else the nearest voxel
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> tree: array<u32>;
 @group(0) @binding(2) var<storage, read_write> output: array<vec4f>;
-@group(0) @binding(3) var bc7: texture_3d<f32>;
-@group(0) @binding(4) var bc4: texture_3d<f32>;
-@group(0) @binding(5) var unorm8: texture_3d<f32>;
-@group(0) @binding(6) var f16_: texture_3d<f32>;
-@group(0) @binding(7) var f32_: texture_3d<f32>;
+// From binding 3 on a texture a codec. They and vp_texel, which reads them, are written by src/render/gpu/pipelines.rs.
 
 fn vp_word(i: u32) -> u32 {
     return tree[i];
-}
-
-// One page a codec is bound here; an engine with more chooses by page.
-fn vp_texel(codec: u32, page: u32, p: vec3i) -> vec4f {
-    if (VP_CODECS & 2u) != 0u && codec == 1u { return textureLoad(bc7, p, 0); }
-    if (VP_CODECS & 4u) != 0u && codec == 2u { return textureLoad(bc4, p, 0); }
-    if (VP_CODECS & 8u) != 0u && codec == 3u { return textureLoad(unorm8, p, 0); }
-    if (VP_CODECS & 16u) != 0u && codec == 4u { return textureLoad(f16_, p, 0); }
-    return textureLoad(f32_, p, 0);
 }
 
 const DENSITY = 0u;

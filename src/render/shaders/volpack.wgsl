@@ -23,7 +23,7 @@
 const VP_NONE = 0xffffffffu;
 const VP_NO_MASK = 0x3fffffffu;
 const VP_BC7 = 1u;
-const VP_F16 = 4u;
+const VP_NORMALISED = 14u;            // bit t is on if texels of codec tag t are fractions of the brick's range
 
 // What a host may promise of its packs when it makes a pipeline: code for what does not occur is left
 // out.
@@ -190,12 +190,12 @@ fn vp_brick(g: VpGrid, node: VpNode) -> VpBrick {
     } else {
         brick.shift -= node.min;
     }
-    if codec >= VP_F16 {
-        brick.offset = 0.0;
-        brick.scale = 1.0;
-    } else {
+    if ((VP_NORMALISED >> codec) & 1u) != 0u {
         brick.offset = g.lo + g.span * (f32(r.z & 0xffffu) / 65535.0);
         brick.scale = g.span * unpack2x16float(r.z).y;
+    } else {
+        brick.offset = 0.0;
+        brick.scale = 1.0;
     }
     return brick;
 }

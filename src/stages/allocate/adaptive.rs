@@ -1,7 +1,7 @@
 //! Every brick in the codec that serves the whole best.
 
 use super::Allocation;
-use super::choices::AT_ONCE;
+use super::choices::tried_at_once;
 use super::search::GridSearch;
 use super::size::at_size;
 use super::target::{AdaptiveGrid, Target};
@@ -9,7 +9,7 @@ use crate::cancel::CancelToken;
 use crate::error::Result;
 use crate::settings::{FRAME_MARGIN_DB, Quality};
 
-/// Gives each brick of each grid its codec. `advance` hears of bricks that BC7 was tried on.
+/// Gives each brick of each grid its codec. `advance` hears of bricks that slow codecs were tried on.
 ///
 /// # Errors
 /// When bricks cannot be read, a scratch file fails, or the work is cancelled.
@@ -22,7 +22,7 @@ pub fn adaptive(
     let mut searches = Vec::new();
     for grid in grids {
         let all: Vec<u32> = (0..grid.tree.pool.len()).collect();
-        grid.encoders.make(grid.tree, &all, &AT_ONCE, |_| ())?;
+        grid.encoders.make(grid.tree, &all, &tried_at_once(), |_| ())?;
         searches.push(GridSearch::new(grid, cancel.clone())?);
     }
     let picks = match target.size {

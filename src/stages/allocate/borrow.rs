@@ -18,12 +18,12 @@ use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use crate::cancel::CancelToken;
-use crate::codec::{BrickRange, Half, SequenceRange, decode};
+use crate::codec::{BrickRange, Half, SequenceRange, TexelCodec, decode};
 use crate::error::Result;
 use crate::pods;
 use crate::profile;
 use crate::stages::dedup::SequenceTree;
-use crate::stages::encoder_cache::{Batch, Cost, EncoderCache, KeptCodec, Tried};
+use crate::stages::encoder_cache::{Batch, Cost, EncoderCache, KeptBricks};
 use crate::volume::{BRICK_VOXELS, Brick, Mask512, ScratchResult};
 
 /// Bricks to either side that a batch is compared with at least: in short frames those of a few.
@@ -32,7 +32,7 @@ const LEAST_NEAR: usize = 128;
 const ROWS: usize = 32;
 /// Borrowers of batches that are compared side by side, so that all cores have work to the end. The referenced bricks of a batch
 /// more to either side are in memory, 2.4 KB each.
-const AT_ONCE: usize = 640;
+const BORROWERS_SIDE_BY_SIDE: usize = 640;
 /// Lenders that are compared voxel by voxel.
 const CLOSEST: usize = 3;
 /// Values of a shape as it is first compared: means of 2³ voxels.
@@ -91,7 +91,7 @@ pub struct OfferInputs {
     /// How many referenced bricks each of the batches has: places are told from each other by it.
     pub counts: Vec<usize>,
     /// The place of each referenced brick in its frame, and its codec.
-    pub referenced_bricks: Vec<(u32, KeptCodec)>,
+    pub referenced_bricks: Vec<(u32, TexelCodec)>,
 }
 
 /// A brick that could lend, with its texels as a GPU reads them, 0 to 1.
@@ -116,12 +116,12 @@ pub(super) fn texel_references(
     encoders: &EncoderCache,
     tree: &mut SequenceTree,
     borrows: impl Fn(u32) -> bool,
-    lends: impl Fn(u32) -> Option<KeptCodec>,
+    lends: impl Fn(u32) -> Option<TexelCodec>,
     earlier: Option<&dyn EarlierOffers>,
     cancel: &CancelToken,
     mut visit: impl FnMut(&[u32], Vec<Vec<TexelReference>>) -> Result<()>,
 ) -> Result<()> {
-    let referenced_bricks = |ids: &Range<u32>| -> Vec<(u32, KeptCodec)> {
+    let referenced_bricks = |ids: &Range<u32>| -> Vec<(u32, TexelCodec)> {
         ids.clone().filter_map(|id| Some((id, lends(id)?))).collect()
     };
     let mut near = Near::default();
@@ -177,7 +177,7 @@ fn together(comparisons: &[Comparison]) -> &[Comparison] {
     let mut borrowers = 0;
     let fits = |comparison: &&Comparison| {
         borrowers += comparison.borrowers.len();
-        borrowers <= AT_ONCE
+        borrowers <= BORROWERS_SIDE_BY_SIDE
     };
     &comparisons[..comparisons.iter().take_while(fits).count().max(1)]
 }
@@ -188,7 +188,7 @@ struct Comparison {
     /// The batches that the referenced bricks are in.
     around: Range<usize>,
     borrowers: Vec<u32>,
-    referenced_bricks: Vec<(u32, KeptCodec)>,
+    referenced_bricks: Vec<(u32, TexelCodec)>,
 }
 
 impl Comparison {
@@ -248,7 +248,7 @@ fn around(batches: &[Batch], batch: usize) -> Range<usize> {
 }
 
 /// How many of some referenced bricks, ascending, are in a range.
-fn count(referenced_bricks: &[(u32, KeptCodec)], ids: &Range<u32>) -> usize {
+fn count(referenced_bricks: &[(u32, TexelCodec)], ids: &Range<u32>) -> usize {
     let before = |end: u32| referenced_bricks.partition_point(|(id, _)| *id < end);
     before(ids.end) - before(ids.start)
 }
@@ -266,7 +266,7 @@ impl Near {
         encoders: &EncoderCache,
         tree: &SequenceTree,
         comparisons: &[Comparison],
-        referenced_bricks: &impl Fn(&Range<u32>) -> Vec<(u32, KeptCodec)>,
+        referenced_bricks: &impl Fn(&Range<u32>) -> Vec<(u32, TexelCodec)>,
     ) -> Result<()> {
         let around = comparisons[0].around.start..comparisons[comparisons.len() - 1].around.end;
         self.batches.retain(|batch, _| around.contains(batch));
@@ -288,19 +288,19 @@ impl Near {
 fn decoded(
     encoders: &EncoderCache,
     tree: &SequenceTree,
-    referenced_bricks: &[(u32, KeptCodec)],
+    referenced_bricks: &[(u32, TexelCodec)],
 ) -> Result<Vec<Lender>> {
-    let mut places: [Vec<u32>; KeptCodec::ALL.len()] = Default::default();
+    let mut places: [Vec<u32>; TexelCodec::ALL.len()] = Default::default();
     let mut tried = Vec::new();
     for &(id, codec) in referenced_bricks {
-        places[codec as usize].push(id);
+        places[codec.index()].push(id);
     }
-    for codec in KeptCodec::ALL {
-        tried.push(encoders.texels(&places[codec as usize], codec)?);
+    for codec in TexelCodec::ALL {
+        tried.push(encoders.texels(&places[codec.index()], codec)?);
     }
-    let referenced = |&(id, codec): &(u32, KeptCodec)| {
-        let place = places[codec as usize].binary_search(&id).expect("every lender is of one of the codecs");
-        let (Tried { costs, bytes, axes }, codec) = (&tried[codec as usize], codec.codec());
+    let referenced = |&(id, codec): &(u32, TexelCodec)| {
+        let place = places[codec.index()].binary_search(&id).expect("every lender is of one of the codecs");
+        let (KeptBricks { costs, bytes, axes }, codec) = (&tried[codec.index()], codec.codec());
         let size = codec.layout().brick_bytes();
         let (bytes, axis) = (&bytes[place * size..][..size], axes[place]);
         let texels = decode(codec, bytes, axis, &SequenceRange::default(), BrickRange::SEQUENCE);
@@ -400,7 +400,7 @@ impl<'a> Codebook<'a> {
         encoders: &EncoderCache,
         ids: &[u32],
         bricks: &[Brick],
-        places: &[(u32, KeptCodec)],
+        places: &[(u32, TexelCodec)],
     ) -> Result<Offers> {
         let mut means = Vec::with_capacity(bricks.len());
         let mut shapes = Array2::<f32>::zeros((bricks.len(), COARSE));

@@ -1,6 +1,6 @@
 //! The ways to code a brick.
 
-use crate::codec::Codec;
+use crate::codec::TexelCodec;
 
 /// One of the ways.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -10,56 +10,64 @@ pub(super) enum Candidate {
     Constant,
     /// Another brick's texels: it costs what a constant costs.
     Borrowed,
-    Bc7,
-    Bc4,
-    Unorm8,
-    F16,
-    F32,
+    Texels(TexelCodec),
 }
 
-impl Candidate {
-    /// By ascending bits.
-    pub const ALL: [Self; 8] = [
-        Self::Empty,
-        Self::Constant,
-        Self::Borrowed,
-        Self::Bc7,
-        Self::Bc4,
-        Self::Unorm8,
-        Self::F16,
-        Self::F32,
-    ];
+/// A value for each candidate, by [`Candidate::index`].
+pub(super) type PerCandidate<T> = [T; Candidate::ALL.len()];
 
-    /// The codec of its own texels; `Constant` where it has none.
-    pub fn codec(self) -> Codec {
+impl Candidate {
+    /// How many there are without texels of their own.
+    const WITHOUT_TEXELS: usize = 3;
+
+    /// By ascending bits.
+    pub const ALL: [Self; Self::WITHOUT_TEXELS + TexelCodec::ALL.len()] = {
+        let mut all = [Self::Empty; Self::WITHOUT_TEXELS + TexelCodec::ALL.len()];
+        all[1] = Self::Constant;
+        all[2] = Self::Borrowed;
+        let mut i = 0;
+        while i < TexelCodec::ALL.len() {
+            all[Self::WITHOUT_TEXELS + i] = Self::Texels(TexelCodec::ALL[i]);
+            i += 1;
+        }
+        all
+    };
+
+    /// The one without error, which any brick can have.
+    pub const EXACT: Self = Self::Texels(TexelCodec::EXACT);
+
+    /// Its place in [`Self::ALL`].
+    pub fn index(self) -> usize {
         match self {
-            Self::Empty | Self::Constant | Self::Borrowed => Codec::Constant,
-            Self::Bc7 => Codec::Bc7,
-            Self::Bc4 => Codec::Bc4,
-            Self::Unorm8 => Codec::Unorm8,
-            Self::F16 => Codec::F16,
-            Self::F32 => Codec::F32,
+            Self::Empty => 0,
+            Self::Constant => 1,
+            Self::Borrowed => 2,
+            Self::Texels(codec) => Self::WITHOUT_TEXELS + codec.index(),
         }
     }
 
-    /// How many have a cost that depends on the brick alone.
-    pub const OWN: usize = 6;
+    /// How many have an error that depends on the brick alone: all but [`Self::Borrowed`] and [`Self::EXACT`].
+    pub const WITH_OWN_ERROR: usize = Self::ALL.len() - 2;
 
     /// Its place among those.
-    pub fn own(self) -> Option<usize> {
+    pub fn own_error_index(self) -> Option<usize> {
         match self {
-            Self::Empty => Some(0),
-            Self::Constant => Some(1),
-            Self::Bc7 => Some(2),
-            Self::Bc4 => Some(3),
-            Self::Unorm8 => Some(4),
-            Self::F16 => Some(5),
-            Self::Borrowed | Self::F32 => None,
+            Self::Borrowed | Self::EXACT => None,
+            Self::Empty | Self::Constant => Some(self.index()),
+            Self::Texels(_) => Some(self.index() - 1),
+        }
+    }
+
+    /// The codec of its own texels, if it has any.
+    pub fn codec(self) -> Option<TexelCodec> {
+        match self {
+            Self::Texels(codec) => Some(codec),
+            Self::Empty | Self::Constant | Self::Borrowed => None,
         }
     }
 
     /// Bits of the texels of a brick.
     pub fn texel_bits(self) -> u32 {
-        8 * self.codec().layout().brick_bytes() as u32
+        self.codec().map_or(0, |codec| 8 * codec.codec().layout().brick_bytes() as u32)
     }
 }

@@ -6,8 +6,9 @@ use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
 
 use super::borrow::TexelReference;
-use super::candidate::Candidate;
-use crate::stages::encoder_cache::{Cost, EncoderCache, KeptCodec, Kind};
+use super::candidate::{Candidate, PerCandidate};
+use crate::codec::TexelCodec;
+use crate::stages::encoder_cache::{Cost, EncoderCache, Trial};
 use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder, ScratchResult};
 
 /// An L3 record is three words.
@@ -20,9 +21,9 @@ pub(super) const RECORD_BITS: u32 = 96;
 #[repr(C)]
 pub(super) struct Choices {
     /// Over all users and over all the voxels that texels give.
-    distortion: [f32; Candidate::OWN],
+    distortion: [f32; Candidate::WITH_OWN_ERROR],
     /// Over active voxels.
-    active_squares: [f32; Candidate::OWN],
+    active_squares: [f32; Candidate::WITH_OWN_ERROR],
     /// How often the brick is used over all frames.
     uses: u32,
     /// How many L3 records it has: one in every run that it is in.
@@ -37,7 +38,7 @@ impl Choices {
 
     /// Notes what a candidate comes to.
     fn set(&mut self, candidate: Candidate, cost: Cost, peak: f64) {
-        let Some(i) = candidate.own() else { return };
+        let Some(i) = candidate.own_error_index() else { return };
         // What is infinite is out of the question, so nothing else may be.
         let narrow = |v: f64| if v.is_infinite() { f32::INFINITY } else { (v as f32).min(f32::MAX) };
         self.distortion[i] = narrow(in_peaks(cost.error_l2, peak) * f64::from(self.uses));
@@ -64,7 +65,7 @@ impl Weighed<'_> {
     pub fn distortion(&self, candidate: Candidate) -> f64 {
         match candidate {
             Candidate::Borrowed => self.reference.map_or(f64::INFINITY, |reference| self.borrowed(reference)),
-            candidate => candidate.own().map_or(0.0, |i| self.choices.distortion[i].into()),
+            candidate => candidate.own_error_index().map_or(0.0, |i| self.choices.distortion[i].into()),
         }
     }
 
@@ -79,19 +80,19 @@ impl Weighed<'_> {
             Candidate::Borrowed => self
                 .reference
                 .map_or(f64::INFINITY, |reference| in_peaks(reference.active_error_l2, self.table.peak)),
-            candidate => candidate.own().map_or(0.0, |i| self.choices.active_squares[i].into()),
+            candidate => candidate.own_error_index().map_or(0.0, |i| self.choices.active_squares[i].into()),
         }
     }
 
     /// The bits of the texels and of all records.
     pub fn bits(&self, candidate: Candidate) -> f64 {
         let records = if candidate == Candidate::Empty { 0 } else { self.choices.records };
-        self.table.texel_bits[candidate as usize] + f64::from(RECORD_BITS) * f64::from(records)
+        self.table.texel_bits[candidate.index()] + f64::from(RECORD_BITS) * f64::from(records)
     }
 
     /// The candidate with the least D + λR; of equals the one of fewest bits.
     pub fn best(&self, lambda: f64) -> Candidate {
-        let (mut best, mut least) = (Candidate::F32, f64::INFINITY);
+        let (mut best, mut least) = (Candidate::EXACT, f64::INFINITY);
         for candidate in Candidate::ALL {
             let cost = self.distortion(candidate) + lambda * self.bits(candidate);
             if cost < least {
@@ -115,7 +116,7 @@ pub(super) struct Table {
     /// What errors are measured against.
     pub peak: f64,
     /// Of each candidate; looked up more than anything else.
-    texel_bits: [f64; Candidate::ALL.len()],
+    texel_bits: PerCandidate<f64>,
     bricks: u32,
     choices: Scratch,
     /// What bricks borrow, and which of them do.
@@ -142,14 +143,11 @@ impl Table {
     ///
     /// # Errors
     /// When the scratch file cannot be written.
-    pub fn add(
-        &mut self,
-        bricks: impl Iterator<Item = (Choices, [Cost; Candidate::ALL.len()])>,
-    ) -> ScratchResult<()> {
+    pub fn add(&mut self, bricks: impl Iterator<Item = (Choices, PerCandidate<Cost>)>) -> ScratchResult<()> {
         for (mut choices, costs) in bricks {
             Candidate::ALL
                 .into_iter()
-                .for_each(|candidate| choices.set(candidate, costs[candidate as usize], self.peak));
+                .for_each(|candidate| choices.set(candidate, costs[candidate.index()], self.peak));
             self.choices.put(self.bricks, bytemuck::bytes_of(&choices))?;
             self.bricks += 1;
         }
@@ -250,36 +248,64 @@ impl Table {
     }
 }
 
-/// What candidates do to some bricks, by [`Candidate::ALL`], and [`Candidate::Constant`]'s values. What was not tried costs nothing,
-/// and texel references are not among it.
+/// The bricks that a search has tried each codec on that is [tried on demand](TexelCodec::is_on_demand). A cache may know of
+/// more, but what it knows by chance must not lead the search elsewhere.
+pub(super) struct OnDemand(Vec<(TexelCodec, Vec<bool>)>);
+
+impl OnDemand {
+    /// None yet, of so many bricks.
+    pub fn new(bricks: usize) -> Self {
+        let codecs = TexelCodec::ALL.into_iter().filter(|codec| codec.is_on_demand());
+        Self(codecs.map(|codec| (codec, vec![false; bricks])).collect())
+    }
+
+    /// For each of the codecs whether it was tried on each brick.
+    pub fn iter(&self) -> impl Iterator<Item = (TexelCodec, &[bool])> {
+        self.0.iter().map(|(codec, is_tried)| (*codec, &is_tried[..]))
+    }
+
+    /// The same, to note more of them.
+    pub fn iter_mut(&mut self) -> impl Iterator<Item = (TexelCodec, &mut [bool])> {
+        self.0.iter_mut().map(|(codec, is_tried)| (*codec, &mut is_tried[..]))
+    }
+}
+
+/// What every brick is tried as before anything is chosen.
+pub(super) fn tried_at_once() -> Vec<Trial> {
+    let codecs = TexelCodec::ALL.into_iter().filter(|codec| codec.keeps_texels() && !codec.is_on_demand());
+    [Trial::Plain].into_iter().chain(codecs.map(Trial::Texels)).collect()
+}
+
+/// What candidates do to some bricks, and [`Candidate::Constant`]'s values. What was not tried costs nothing, and texel
+/// references are not among it.
 pub(super) fn costs(
     encoders: &EncoderCache,
     ids: &[u32],
-    bc7_is_tried: &[bool],
-) -> ScratchResult<Vec<([Cost; Candidate::ALL.len()], f32)>> {
+    on_demand: &OnDemand,
+) -> ScratchResult<Vec<(PerCandidate<Cost>, f32)>> {
     let mut all = Vec::with_capacity(ids.len());
     for plain in encoders.plain(ids)? {
         let mut costs = [Cost::NONE; Candidate::ALL.len()];
-        costs[Candidate::Empty as usize] = plain.empty;
-        costs[Candidate::Constant as usize] = plain.constant;
-        costs[Candidate::F16 as usize] = plain.f16;
-        costs[Candidate::Borrowed as usize] = Cost::IMPOSSIBLE;
+        costs[Candidate::Empty.index()] = plain.empty;
+        costs[Candidate::Constant.index()] = plain.constant;
+        costs[Candidate::Borrowed.index()] = Cost::IMPOSSIBLE;
+        for (codec, cost) in TexelCodec::ERROR_ONLY.into_iter().zip(plain.error_only) {
+            costs[Candidate::Texels(codec).index()] = cost;
+        }
         all.push((costs, plain.value));
     }
-    for (candidate, codec) in [(Candidate::Bc4, KeptCodec::Bc4), (Candidate::Unorm8, KeptCodec::Unorm8)] {
+    for trial in tried_at_once() {
+        let Trial::Texels(codec) = trial else { continue };
         for ((costs, _), cost) in all.iter_mut().zip(encoders.costs(ids, codec)?) {
-            costs[candidate as usize] = cost;
+            costs[Candidate::Texels(codec).index()] = cost;
         }
     }
-    let tried = || (0..ids.len()).filter(|&i| bc7_is_tried[ids[i] as usize]);
-    let bc7: Vec<u32> = tried().map(|i| ids[i]).collect();
-    for (i, cost) in tried().zip(encoders.costs(&bc7, KeptCodec::Bc7)?) {
-        all[i].0[Candidate::Bc7 as usize] = cost;
+    for (codec, is_tried) in on_demand.iter() {
+        let tried = || (0..ids.len()).filter(|&i| is_tried[ids[i] as usize]);
+        let tried_ids: Vec<u32> = tried().map(|i| ids[i]).collect();
+        for (i, cost) in tried().zip(encoders.costs(&tried_ids, codec)?) {
+            all[i].0[Candidate::Texels(codec).index()] = cost;
+        }
     }
     Ok(all)
 }
-
-/// What all bricks are tried with before anything is chosen: BC7 takes twenty times as long as all of it, and is tried
-/// when it is asked for.
-pub(super) const AT_ONCE: [Kind; 3] =
-    [Kind::Plain, Kind::Texels(KeptCodec::Bc4), Kind::Texels(KeptCodec::Unorm8)];

@@ -6,7 +6,7 @@ use rayon::prelude::*;
 
 use super::kmeans::{KMeansSettings, kmeans};
 use super::{Allocation, Coding, Shape, windows};
-use crate::codec::{BrickRange, Codec, SequenceRange, Texels, decode, encode};
+use crate::codec::{BrickRange, SequenceRange, TexelCodec, Texels, decode, encode};
 use crate::error::{Error, Result};
 use crate::settings::{Clustering, RangeMode};
 use crate::stages::dedup::{SequenceTree, texel_mask};
@@ -22,7 +22,7 @@ pub fn clustered(
     grid: &str,
     tree: &mut SequenceTree,
     encoders: &EncoderCache,
-    codec: Codec,
+    codec: TexelCodec,
     mode: RangeMode,
     clustering: &Clustering,
 ) -> Result<Allocation> {
@@ -53,7 +53,7 @@ pub fn clustered(
         found.centroids.rows().into_iter().map(|row| texels(&sequence, mode, &row.to_vec())).collect();
     let encoded = encode(codec, &sequence, &centroids)
         .map_err(|source| Error::OutOfRange { grid: grid.to_owned(), source })?;
-    let size = codec.layout().brick_bytes();
+    let size = codec.codec().layout().brick_bytes();
     allocation.shapes = encoded
         .bytes
         .chunks_exact(size)
@@ -64,7 +64,7 @@ pub fn clustered(
         .shapes
         .par_iter()
         .zip(&centroids)
-        .map(|(shape, texels)| decode(codec, &shape.bytes, shape.axis, &sequence, texels.range))
+        .map(|(shape, texels)| decode(codec.codec(), &shape.bytes, shape.axis, &sequence, texels.range))
         .collect();
 
     // Texels that are fractions are read by the range that they were made with; what bounds raw ones is what they
@@ -72,7 +72,11 @@ pub fn clustered(
     let ranges: Vec<BrickRange> = decoded
         .iter()
         .zip(&centroids)
-        .map(|(values, texels)| if codec.is_normalised() { texels.range } else { fit(&sequence, values) })
+        .map(
+            |(values, texels)| {
+                if codec.codec().is_normalised() { texels.range } else { fit(&sequence, values) }
+            },
+        )
         .collect();
 
     let mut members = ids.iter().zip(&found.members).peekable();

@@ -1,7 +1,7 @@
 //! Stage 5: how each brick is coded, and what its texels' 0 and 1 stand for.
 //!
-//! A uniform format gives every brick one codec. The adaptive one gives each the one that serves the whole best (`search`, `size`), as rate-distortion theory has it: the least
-//! D + λR, with one λ for all (Shoham & Gersho 1988).
+//! A uniform format gives every brick one codec. The adaptive one gives each the one that serves the whole best
+//! (`search`, `size`), as rate-distortion theory has it: the least D + λR, with one λ for all (Shoham & Gersho 1988).
 
 mod adaptive;
 mod borrow;
@@ -17,7 +17,7 @@ use half::f16;
 
 use super::dedup::SequenceTree;
 use super::encoder_cache::{EncoderCache, own_range};
-use crate::codec::{BrickRange, Codec, SequenceRange};
+use crate::codec::{BrickRange, Codec, Fidelity, SequenceRange, TexelCodec};
 use crate::settings::RangeMode;
 use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder, ScratchResult, SortedMap, ValueRange};
 
@@ -31,7 +31,7 @@ pub struct Allocation {
     /// The range that brick ranges are fractions of.
     pub sequence: SequenceRange,
     /// How each brick of the pool is coded, as far as a byte says it.
-    kinds: Vec<Kind>,
+    tags: Vec<CodingTag>,
     /// What else there is to say of those of which it does not say all: a value's bits, a referenced brick, a shape.
     words: SortedMap<u32>,
     /// Texels of no brick's own that several bricks share.
@@ -54,7 +54,7 @@ pub enum Coding {
     /// One value for all voxels that no rule gives.
     Constant(f32),
     /// Texels of its own.
-    Own(Codec),
+    Own(TexelCodec),
     /// The texels of this brick, which are its own.
     Borrowed(u32),
     /// The texels of this place of [`Allocation::shapes`], which stand for a cluster of bricks.
@@ -63,10 +63,10 @@ pub enum Coding {
 
 /// A [`Coding`] in a byte.
 #[derive(Clone, Copy)]
-enum Kind {
+enum CodingTag {
     Empty,
     Constant,
-    Own(Codec),
+    Own(TexelCodec),
     Borrowed,
     Clustered,
 }
@@ -81,7 +81,7 @@ pub struct BrickErrors {
 /// Texels that several bricks share, each with its own range.
 pub struct Shape {
     /// Their codec.
-    pub codec: Codec,
+    pub codec: TexelCodec,
     /// One brick's bytes.
     pub bytes: Vec<u8>,
     /// Their packing axis.
@@ -123,7 +123,7 @@ impl Allocation {
     fn new(scratch: &ScratchFolder, encoders: &EncoderCache) -> Self {
         Self {
             sequence: encoders.sequence,
-            kinds: Vec::new(),
+            tags: Vec::new(),
             words: SortedMap::default(),
             shapes: Vec::new(),
             borrowed: SortedMap::default(),
@@ -135,48 +135,48 @@ impl Allocation {
 
     /// Adds the next brick. One that reads texels of another has a range for them.
     fn push(&mut self, coding: Coding, borrowed: Option<BrickRange>) {
-        let id = self.kinds.len() as u32;
-        let (kind, word) = match coding {
-            Coding::Empty => (Kind::Empty, None),
-            Coding::Constant(value) => (Kind::Constant, Some(value.to_bits())),
-            Coding::Own(codec) => (Kind::Own(codec), None),
-            Coding::Borrowed(referenced) => (Kind::Borrowed, Some(referenced)),
-            Coding::Clustered(shape) => (Kind::Clustered, Some(shape)),
+        let id = self.tags.len() as u32;
+        let (tag, word) = match coding {
+            Coding::Empty => (CodingTag::Empty, None),
+            Coding::Constant(value) => (CodingTag::Constant, Some(value.to_bits())),
+            Coding::Own(codec) => (CodingTag::Own(codec), None),
+            Coding::Borrowed(referenced) => (CodingTag::Borrowed, Some(referenced)),
+            Coding::Clustered(shape) => (CodingTag::Clustered, Some(shape)),
         };
-        self.kinds.push(kind);
+        self.tags.push(tag);
         word.into_iter().for_each(|word| self.words.push(id, word));
         borrowed.into_iter().for_each(|range| self.borrowed.push(id, range));
     }
 
     /// Whether a brick was left out: what was there is background.
     pub fn is_empty_brick(&self, brick: u32) -> bool {
-        matches!(self.kinds[brick as usize], Kind::Empty)
+        matches!(self.tags[brick as usize], CodingTag::Empty)
     }
 
     /// Whether any was.
     pub fn has_empty_bricks(&self) -> bool {
-        self.kinds.iter().any(|kind| matches!(kind, Kind::Empty))
+        self.tags.iter().any(|tag| matches!(tag, CodingTag::Empty))
     }
 
     /// How many bricks there are.
     pub fn len(&self) -> u32 {
-        self.kinds.len() as u32
+        self.tags.len() as u32
     }
 
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
-        self.kinds.is_empty()
+        self.tags.is_empty()
     }
 
     /// How a brick is coded.
     pub fn coding(&self, brick: u32) -> Coding {
         let word = || self.words.get(brick).expect("what a byte does not say is said beside it");
-        match self.kinds[brick as usize] {
-            Kind::Empty => Coding::Empty,
-            Kind::Constant => Coding::Constant(f32::from_bits(word())),
-            Kind::Own(codec) => Coding::Own(codec),
-            Kind::Borrowed => Coding::Borrowed(word()),
-            Kind::Clustered => Coding::Clustered(word()),
+        match self.tags[brick as usize] {
+            CodingTag::Empty => Coding::Empty,
+            CodingTag::Constant => Coding::Constant(f32::from_bits(word())),
+            CodingTag::Own(codec) => Coding::Own(codec),
+            CodingTag::Borrowed => Coding::Borrowed(word()),
+            CodingTag::Clustered => Coding::Clustered(word()),
         }
     }
 
@@ -184,9 +184,9 @@ impl Allocation {
     pub fn codec(&self, brick: u32) -> Codec {
         match self.coding(brick) {
             Coding::Empty | Coding::Constant(_) => Codec::Constant,
-            Coding::Own(codec) => codec,
+            Coding::Own(codec) => codec.codec(),
             Coding::Borrowed(referenced) => self.codec(referenced),
-            Coding::Clustered(shape) => self.shapes[shape as usize].codec,
+            Coding::Clustered(shape) => self.shapes[shape as usize].codec.codec(),
         }
     }
 
@@ -194,11 +194,13 @@ impl Allocation {
     pub fn range(&self, tree: &SequenceTree, brick: u32) -> BrickRange {
         let ValueRange { min, max } = tree.brick_ranges[brick];
         match self.coding(brick) {
-            Coding::Own(Codec::F32) => self.sequence.fit(min, max),
-            // What bounds a voxel is what its texel decodes to.
-            Coding::Own(Codec::F16) => {
-                let [min, max] = [min, max].map(|v| f16::from_f32(v).to_f32());
-                self.sequence.fit(min, max)
+            Coding::Own(codec) if !codec.codec().is_normalised() => {
+                // What bounds a voxel is what its texel decodes to.
+                let decoded = |value: f32| match codec.codec().fidelity() {
+                    Fidelity::NearestHalf => f16::from_f32(value).to_f32(),
+                    _ => value,
+                };
+                self.sequence.fit(decoded(min), decoded(max))
             }
             _ => self
                 .borrowed
@@ -214,7 +216,7 @@ fn windows(bricks: u32, size: u32) -> impl Iterator<Item = Vec<u32>> {
 }
 
 /// Gives every brick of `tree` one codec.
-pub fn uniform(tree: &SequenceTree, encoders: &EncoderCache, codec: Codec) -> Allocation {
+pub fn uniform(tree: &SequenceTree, encoders: &EncoderCache, codec: TexelCodec) -> Allocation {
     let mut allocation = Allocation::new(&tree.scratch, encoders);
     (0..tree.pool.len()).for_each(|_| allocation.push(Coding::Own(codec), None));
     allocation

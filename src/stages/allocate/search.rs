@@ -2,23 +2,24 @@
 //!
 //! Every brick takes the codec with the least D + λR. One λ serves all bricks of a search, and is found by
 //! bisection on a fixed grid of steps; then single bricks are moved from one step's choice to the next one's, most
-//! gain per bit first, until the target is just met. BC7 is dear to try, so a brick that it has not been tried on
-//! counts as one that it serves without error: whoever prefers something else even then never needs it, and whoever
+//! gain per bit first, until the target is just met. A codec that is slow to try counts as one that serves
+//! a brick without error until it was tried on it: whoever prefers something else even then never needs it, and whoever
 //! chooses it is tried and the search goes on with what was found.
 
 use std::sync::LazyLock;
 
 use super::borrow::{TexelReference, texel_references};
 use super::candidate::Candidate;
-use super::choices::{BLOCK, Choices, Table, Weighed, costs};
+use super::choices::{BLOCK, Choices, OnDemand, Table, Weighed, costs};
 use super::target::AdaptiveGrid;
 use super::{Allocation, Coding, EarlierOffers, windows};
 use crate::cancel::CancelToken;
+use crate::codec::TexelCodec;
 use crate::error::Result;
 use crate::profile;
 use crate::settings::Quality;
 use crate::stages::dedup::{FrameTree, Payload, SequenceTree};
-use crate::stages::encoder_cache::{Cost, EncoderCache, KeptCodec, Kind};
+use crate::stages::encoder_cache::{Cost, EncoderCache, Trial};
 
 /// A step is 1.1 % of λ, under 0.05 dB of PSNR.
 const STEPS_PER_OCTAVE: u32 = 64;
@@ -60,9 +61,7 @@ pub(super) struct GridSearch<'a> {
     pub(super) table: Table,
     /// The coarsest step that each brick may have, for the sake of the frames it is in.
     pub(super) least_step: Vec<u16>,
-    /// The bricks that this search asked for in BC7. A cache may know of more, but what it knows by chance must not
-    /// lead the search elsewhere.
-    bc7_is_tried: Vec<bool>,
+    on_demand: OnDemand,
     /// The candidate of bricks that lend their texels.
     lends: Vec<Option<Candidate>>,
     active_voxels: u64,
@@ -83,7 +82,7 @@ impl<'a> GridSearch<'a> {
         }
         let mut search = Self {
             least_step: vec![0; uses.len()],
-            bc7_is_tried: vec![false; uses.len()],
+            on_demand: OnDemand::new(uses.len()),
             lends: vec![None; uses.len()],
             active_voxels: tree.frames.iter().map(|f| f.stats.active_leaf_voxels).sum(),
             voxel_size: grid.voxel_size,
@@ -97,10 +96,10 @@ impl<'a> GridSearch<'a> {
             tree,
         };
         for ids in windows(uses.len() as u32, BLOCK) {
-            let costs = costs(search.encoders, &ids, &search.bc7_is_tried)?;
+            let costs = costs(search.encoders, &ids, &search.on_demand)?;
             let choices = |&id: &u32| Choices::new(uses[id as usize], records[id as usize]);
             search.may_vanish |=
-                costs.iter().any(|(costs, _)| costs[Candidate::Empty as usize].error_l2 > 0.0);
+                costs.iter().any(|(costs, _)| costs[Candidate::Empty.index()].error_l2 > 0.0);
             search.table.add(ids.iter().map(choices).zip(costs.into_iter().map(|(costs, _)| costs)))?;
         }
         search.may_vanish &= !search.tree.has_constants();
@@ -135,7 +134,7 @@ impl<'a> GridSearch<'a> {
         if step == 0 {
             // The coarsest there is: no error is too large.
             let possible = |candidate: &Candidate| weighed.distortion(*candidate).is_finite();
-            return Candidate::ALL.into_iter().find(possible).unwrap_or(Candidate::F32);
+            return Candidate::ALL.into_iter().find(possible).unwrap_or(Candidate::EXACT);
         }
         weighed.best(lambda(step))
     }
@@ -162,15 +161,21 @@ impl<'a> GridSearch<'a> {
         picks: impl Iterator<Item = (u32, Candidate)>,
         advance: &mut dyn FnMut(u64),
     ) -> Result<bool> {
-        let unknown =
-            picks.filter(|&(id, candidate)| candidate == Candidate::Bc7 && !self.bc7_is_tried[id as usize]);
-        let unknown: Vec<u32> = unknown.map(|(id, _)| id).collect();
-        self.encoders.make(self.tree, &unknown, &[Kind::Texels(KeptCodec::Bc7)], advance)?;
-        for ids in unknown.chunks(BLOCK as usize) {
-            self.table.weigh(ids, Candidate::Bc7, &self.encoders.costs(ids, KeptCodec::Bc7)?)?;
-            ids.iter().for_each(|&id| self.bc7_is_tried[id as usize] = true);
+        let picks: Vec<(u32, Candidate)> =
+            picks.filter(|(_, candidate)| candidate.codec().is_some_and(TexelCodec::is_on_demand)).collect();
+        let mut is_any = false;
+        for (codec, is_tried) in self.on_demand.iter_mut() {
+            let candidate = Candidate::Texels(codec);
+            let unknown = picks.iter().filter(|(id, pick)| *pick == candidate && !is_tried[*id as usize]);
+            let unknown: Vec<u32> = unknown.map(|(id, _)| *id).collect();
+            self.encoders.make(self.tree, &unknown, &[Trial::Texels(codec)], &mut *advance)?;
+            for ids in unknown.chunks(BLOCK as usize) {
+                self.table.weigh(ids, candidate, &self.encoders.costs(ids, codec)?)?;
+                ids.iter().for_each(|&id| is_tried[id as usize] = true);
+            }
+            is_any |= !unknown.is_empty();
         }
-        Ok(!unknown.is_empty())
+        Ok(is_any)
     }
 
     pub(super) fn at_psnr(
@@ -268,7 +273,8 @@ impl<'a> GridSearch<'a> {
         // Who may borrow, and of those who has texels that others can use.
         let whole: Vec<bool> = (0..picks.len() as u32).map(|id| self.encoders.is_whole(id)).collect();
         let borrows = |id: u32| whole[id as usize] && compared[id as usize] != Candidate::Empty;
-        let lends = |id: u32| borrows(id).then(|| KeptCodec::of(compared[id as usize].codec())).flatten();
+        let lends =
+            |id: u32| compared[id as usize].codec().filter(|codec| borrows(id) && codec.keeps_texels());
         let (table, least_step) = (&self.table, &self.least_step);
         let gain = |id: u32, weighed: Weighed, reference: &TexelReference| {
             let lambda = lambda(step.max(least_step[id as usize].into()));
@@ -326,12 +332,12 @@ impl<'a> GridSearch<'a> {
         loop {
             let mut picks = Vec::with_capacity(self.table.len() as usize);
             for ids in windows(self.table.len(), BLOCK) {
-                let costs = costs(self.encoders, &ids, &self.bc7_is_tried)?;
+                let costs = costs(self.encoders, &ids, &self.on_demand)?;
                 picks.extend(costs.iter().map(|(costs, _)| {
                     Candidate::ALL
                         .into_iter()
-                        .find(|&candidate| fits(&costs[candidate as usize]))
-                        .unwrap_or(Candidate::F32)
+                        .find(|&candidate| fits(&costs[candidate.index()]))
+                        .unwrap_or(Candidate::EXACT)
                 }));
             }
             if !self.try_unknown((0..).zip(picks.iter().copied()), advance)? {
@@ -436,23 +442,21 @@ impl<'a> GridSearch<'a> {
     }
 
     pub(super) fn finish(self, picks: &[Candidate]) -> Result<Allocation> {
-        let Self { tree, encoders, bc7_is_tried, table, .. } = self;
+        let Self { tree, encoders, on_demand, table, .. } = self;
         let texel_references = table.into_references();
         let mut allocation = Allocation::new(&tree.scratch, encoders);
         for ids in windows(picks.len() as u32, BLOCK) {
             let mut error_l2s = Vec::with_capacity(ids.len());
-            for (&id, (costs, value)) in ids.iter().zip(costs(encoders, &ids, &bc7_is_tried)?) {
+            for (&id, (costs, value)) in ids.iter().zip(costs(encoders, &ids, &on_demand)?) {
                 let candidate = picks[id as usize];
                 let (coding, range, error_l2) = match candidate {
                     Candidate::Borrowed => {
                         let reference = texel_references[&id];
                         (Coding::Borrowed(reference.referenced), Some(reference.range), reference.error_l2)
                     }
-                    Candidate::Empty => (Coding::Empty, None, costs[candidate as usize].error_l2),
-                    Candidate::Constant => {
-                        (Coding::Constant(value), None, costs[candidate as usize].error_l2)
-                    }
-                    candidate => (Coding::Own(candidate.codec()), None, costs[candidate as usize].error_l2),
+                    Candidate::Empty => (Coding::Empty, None, costs[candidate.index()].error_l2),
+                    Candidate::Constant => (Coding::Constant(value), None, costs[candidate.index()].error_l2),
+                    Candidate::Texels(codec) => (Coding::Own(codec), None, costs[candidate.index()].error_l2),
                 };
                 allocation.push(coding, range);
                 error_l2s.push(error_l2);

@@ -1,10 +1,10 @@
 //! The best choice that fits a size, with one λ for all grids of a pack.
 
-use super::candidate::Candidate;
+use super::candidate::{Candidate, PerCandidate};
 use super::choices::RECORD_BITS;
 use super::search::{GridSearch, Switch, first_step, switches};
 use super::target::Target;
-use crate::codec::Codec;
+use crate::codec::TexelCodec;
 use crate::error::Result;
 use crate::pack::plan;
 use crate::pack::tree::NODE_WORDS;
@@ -146,16 +146,16 @@ fn bytes(searches: &[GridSearch], picks: &[Vec<Candidate>], fixed: u64) -> u64 {
 }
 
 /// How many bricks each candidate has.
-fn counts(picks: &[Vec<Candidate>]) -> [u32; Candidate::ALL.len()] {
+fn counts(picks: &[Vec<Candidate>]) -> PerCandidate<u32> {
     let mut counts = [0; Candidate::ALL.len()];
-    picks.iter().flatten().for_each(|&candidate| counts[candidate as usize] += 1);
+    picks.iter().flatten().for_each(|&candidate| counts[candidate.index()] += 1);
     counts
 }
 
 /// What the texture pages of that many bricks take.
-fn texel_bytes(counts: &[u32; Candidate::ALL.len()]) -> u64 {
-    let bytes = |candidate: Candidate| plan(candidate.codec(), counts[candidate as usize]).bytes();
-    Candidate::ALL.into_iter().filter(|candidate| candidate.codec() != Codec::Constant).map(bytes).sum()
+fn texel_bytes(counts: &PerCandidate<u32>) -> u64 {
+    let bytes = |codec: TexelCodec| plan(codec.codec(), counts[Candidate::Texels(codec).index()]).bytes();
+    TexelCodec::ALL.into_iter().map(bytes).sum()
 }
 
 /// What empty bricks do without: their records, and nodes of which nothing is left.

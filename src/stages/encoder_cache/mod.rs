@@ -1,4 +1,4 @@
-//! Stages 5 and 7: what each codec makes of each brick, measured on decoded values. Made once: what was tried to
+//! Stages 5 and 7: what each codec makes of each brick, measured on decoded values. TrialResults once: what was tried to
 //! choose a codec is what goes into the pack.
 
 mod measure;
@@ -9,14 +9,12 @@ use std::collections::BTreeSet;
 use std::ops::Range;
 use std::time::{Duration, Instant};
 
-use half::f16;
-use half::slice::HalfFloatSliceExt;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use super::dedup::{SequenceTree, texel_mask};
 use crate::cancel::CancelToken;
-use crate::codec::{BATCH, BrickRange, Codec, SequenceRange, Texels, decode, encode, spread};
+use crate::codec::{BATCH, BrickRange, SequenceRange, TexelCodec, Texels, decode, encode, spread};
 use crate::error::Result;
 use crate::pods;
 use crate::profile;
@@ -66,33 +64,36 @@ pub struct Plain {
     pub constant: Cost,
     /// As background, without a record.
     pub empty: Cost,
-    /// As half floats.
-    pub f16: Cost,
+    /// In each codec of [`TexelCodec::ERROR_ONLY`].
+    pub error_only: [Cost; TexelCodec::ERROR_ONLY.len()],
 }
 
-/// What is made of bricks and kept.
+/// What a brick is tried as.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-pub enum Kind {
-    /// [`Plain`].
+pub enum Trial {
+    /// Without texels, or with texels that are not kept: [`Plain`].
     Plain,
-    /// Texels of a codec whose texels are fractions of a range.
-    Texels(KeptCodec),
+    /// With texels of a codec that [keeps them](TexelCodec::keeps_texels).
+    Texels(TexelCodec),
 }
 
-impl Kind {
+impl Trial {
     /// All of them.
-    pub const ALL: [Self; 4] = [
-        Self::Plain,
-        Self::Texels(KeptCodec::Bc7),
-        Self::Texels(KeptCodec::Bc4),
-        Self::Texels(KeptCodec::Unorm8),
-    ];
+    pub const ALL: [Self; 1 + TexelCodec::ALL.len()] = {
+        let mut all = [Self::Plain; 1 + TexelCodec::ALL.len()];
+        let mut i = 0;
+        while i < TexelCodec::ALL.len() {
+            all[1 + i] = Self::Texels(TexelCodec::ALL[i]);
+            i += 1;
+        }
+        all
+    };
 
     /// Its place among them.
     pub fn index(self) -> usize {
         match self {
             Self::Plain => 0,
-            Self::Texels(codec) => 1 + codec as usize,
+            Self::Texels(codec) => 1 + codec.index(),
         }
     }
 
@@ -113,47 +114,21 @@ impl Kind {
     }
 }
 
-/// The codecs whose texels are kept. Raw ones take as much to keep as to make.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-pub enum KeptCodec {
-    /// BC7.
-    Bc7,
-    /// BC4.
-    Bc4,
-    /// 8-bit fractions.
-    Unorm8,
-}
-
-impl KeptCodec {
-    /// All of them.
-    pub const ALL: [Self; 3] = [Self::Bc7, Self::Bc4, Self::Unorm8];
-
-    /// The kept one of all codecs.
-    pub fn of(codec: Codec) -> Option<Self> {
-        Self::ALL.into_iter().find(|kept| kept.codec() == codec)
-    }
-
-    /// As one of all codecs.
-    pub fn codec(self) -> Codec {
-        match self {
-            Self::Bc7 => Codec::Bc7,
-            Self::Bc4 => Codec::Bc4,
-            Self::Unorm8 => Codec::Unorm8,
-        }
-    }
-}
-
 impl Plain {
-    const NOTES: usize = 3;
+    const NOTES: usize = 2 + TexelCodec::ERROR_ONLY.len();
 
-    fn to_notes(self) -> [Note; Self::NOTES] {
-        let value = self.value.to_bits();
-        [Note::new(self.constant, value), Note::new(self.empty, 0), Note::new(self.f16, 0)]
+    fn to_notes(self) -> impl Iterator<Item = Note> {
+        let own = [Note::new(self.constant, self.value.to_bits()), Note::new(self.empty, 0)];
+        own.into_iter().chain(self.error_only.map(|cost| Note::new(cost, 0)))
     }
 
-    fn from_notes([constant, empty, f16]: [Note; Self::NOTES]) -> Self {
-        let value = f32::from_bits(constant.word);
-        Self { value, constant: constant.cost(), empty: empty.cost(), f16: f16.cost() }
+    fn from_notes([constant, empty, error_only @ ..]: [Note; Self::NOTES]) -> Self {
+        Self {
+            value: f32::from_bits(constant.word),
+            constant: constant.cost(),
+            empty: empty.cost(),
+            error_only: error_only.map(|note| note.cost()),
+        }
     }
 }
 
@@ -201,11 +176,11 @@ pub trait EarlierResults: Send + Sync {
         memo: &mut Memo,
         tree: &SequenceTree,
         batches: &[Batch],
-        wanted: &[(usize, Kind)],
+        wanted: &[(usize, Trial)],
     ) -> ScratchResult<()>;
 
     /// Notes that `memo` has results of some batches that no earlier build made.
-    fn note_made(&mut self, batches: &BTreeSet<usize>, kind: Kind);
+    fn note_made(&mut self, batches: &BTreeSet<usize>, trial: Trial);
 
     /// Keeps those for later builds.
     ///
@@ -222,8 +197,8 @@ pub struct EncoderCache {
     rules: Vec<InactiveRule>,
     memo: Memo,
     batches: Vec<Batch>,
-    /// For each of them the kinds of which earlier results were asked for.
-    is_loaded: Vec<[bool; Kind::ALL.len()]>,
+    /// For each of them the trials of which earlier results were asked for.
+    is_loaded: Vec<[bool; Trial::ALL.len()]>,
     earlier: Option<Box<dyn EarlierResults>>,
     saved: Instant,
     cancel: CancelToken,
@@ -265,13 +240,13 @@ impl EncoderCache {
         &self.terms
     }
 
-    fn load(&mut self, tree: &SequenceTree, ids: &[u32], kinds: &[Kind]) -> ScratchResult<()> {
+    fn load(&mut self, tree: &SequenceTree, ids: &[u32], trials: &[Trial]) -> ScratchResult<()> {
         let Some(earlier) = &mut self.earlier else { return Ok(()) };
         let mut wanted = Vec::new();
         for batch in batches_of(&self.batches, ids) {
-            for &kind in kinds {
-                if !std::mem::replace(&mut self.is_loaded[batch][kind.index()], true) {
-                    wanted.push((batch, kind));
+            for &trial in trials {
+                if !std::mem::replace(&mut self.is_loaded[batch][trial.index()], true) {
+                    wanted.push((batch, trial));
                 }
             }
         }
@@ -296,7 +271,7 @@ impl EncoderCache {
     /// # Errors
     /// When the scratch file cannot be read back.
     pub fn plain(&self, ids: &[u32]) -> ScratchResult<Vec<Plain>> {
-        let notes = self.memo.notes(Kind::Plain, ids)?;
+        let notes = self.memo.notes(Trial::Plain, ids)?;
         Ok(notes.as_chunks().0.iter().copied().map(Plain::from_notes).collect())
     }
 
@@ -304,17 +279,17 @@ impl EncoderCache {
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn costs(&self, ids: &[u32], codec: KeptCodec) -> ScratchResult<Vec<Cost>> {
-        Ok(self.memo.notes(Kind::Texels(codec), ids)?.iter().map(Note::cost).collect())
+    pub fn costs(&self, ids: &[u32], codec: TexelCodec) -> ScratchResult<Vec<Cost>> {
+        Ok(self.memo.notes(Trial::Texels(codec), ids)?.iter().map(Note::cost).collect())
     }
 
     /// What a codec made of some bricks that it was tried on.
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn texels(&self, ids: &[u32], codec: KeptCodec) -> ScratchResult<Tried> {
-        let Made { notes, texels } = self.memo.made(Kind::Texels(codec), ids)?;
-        Ok(Tried {
+    pub fn texels(&self, ids: &[u32], codec: TexelCodec) -> ScratchResult<KeptBricks> {
+        let TrialResults { notes, texels } = self.memo.made(Trial::Texels(codec), ids)?;
+        Ok(KeptBricks {
             costs: notes.iter().map(Note::cost).collect(),
             bytes: texels,
             axes: notes.iter().map(|note| note.word as u8).collect(),
@@ -342,7 +317,7 @@ impl EncoderCache {
         Measure::new(brick, texel_mask, &self.terms)
     }
 
-    /// Sees to it that some bricks, ascending, are known in every kind. `advance` hears of those that are done.
+    /// Sees to it that some bricks, ascending, are known in every trial. `advance` hears of those that are done.
     ///
     /// # Errors
     /// When bricks cannot be read, or the scratch file not be written.
@@ -350,10 +325,10 @@ impl EncoderCache {
         &mut self,
         tree: &mut SequenceTree,
         ids: &[u32],
-        kinds: &[Kind],
+        trials: &[Trial],
         mut advance: impl FnMut(u64),
     ) -> Result<()> {
-        self.load(tree, ids, kinds)?;
+        self.load(tree, ids, trials)?;
         for window in ids.chunks(BRICKS_IN_FLIGHT as usize) {
             if self.cancel.is_cancelled() {
                 self.save(tree)?;
@@ -362,7 +337,7 @@ impl EncoderCache {
             let missing: Vec<u32> = window
                 .iter()
                 .copied()
-                .filter(|&id| kinds.iter().any(|k| !self.memo.is_known(*k, id)))
+                .filter(|&id| trials.iter().any(|k| !self.memo.is_known(*k, id)))
                 .collect();
             tree.fetch(&missing)?;
             let shared: &SequenceTree = tree;
@@ -370,15 +345,15 @@ impl EncoderCache {
             let threads = rayon::current_num_threads();
             let batches = missing.len().div_ceil(BATCH).next_multiple_of(threads).max(threads);
             let batch = missing.len().div_ceil(batches).max(LEAST_BATCH);
-            let made: Vec<ScratchResult<Vec<Made>>> =
-                missing.par_chunks(batch).map(|ids| self.make_batch(shared, ids, kinds)).collect();
+            let made: Vec<ScratchResult<Vec<TrialResults>>> =
+                missing.par_chunks(batch).map(|ids| self.make_batch(shared, ids, trials)).collect();
             for (ids, made) in missing.chunks(batch).zip(made) {
-                made?.iter().zip(kinds).try_for_each(|(made, kind)| self.memo.add(*kind, ids, made))?;
+                made?.iter().zip(trials).try_for_each(|(made, trial)| self.memo.add(*trial, ids, made))?;
             }
             self.memo.flush()?;
             if let Some(earlier) = &mut self.earlier {
                 let batches = batches_of(&self.batches, &missing);
-                kinds.iter().for_each(|&kind| earlier.note_made(&batches, kind));
+                trials.iter().for_each(|&trial| earlier.note_made(&batches, trial));
             }
             if self.saved.elapsed() > SAVE_EVERY {
                 self.save(tree)?;
@@ -388,19 +363,24 @@ impl EncoderCache {
         Ok(())
     }
 
-    fn make_batch(&self, tree: &SequenceTree, ids: &[u32], kinds: &[Kind]) -> ScratchResult<Vec<Made>> {
+    fn make_batch(
+        &self,
+        tree: &SequenceTree,
+        ids: &[u32],
+        trials: &[Trial],
+    ) -> ScratchResult<Vec<TrialResults>> {
         let _span = profile::span("encode");
         let bricks = &tree.pool.read(ids)?;
         let texels: Vec<Texels> = ids.iter().zip(bricks).map(|(&id, b)| self.prepare(tree, id, b)).collect();
         let each = || ids.iter().zip(bricks).zip(&texels);
-        let made = |kind: &Kind| match *kind {
-            Kind::Plain => {
+        let made = |trial: &Trial| match *trial {
+            Trial::Plain => {
                 let plain = each().map(|((&id, b), t)| self.make_plain(tree, id, b, t));
-                Made { notes: plain.flat_map(Plain::to_notes).collect(), texels: Vec::new() }
+                TrialResults { notes: plain.flat_map(Plain::to_notes).collect(), texels: Vec::new() }
             }
-            Kind::Texels(codec) => self.make_texels(codec.codec(), bricks, &texels),
+            Trial::Texels(codec) => self.make_texels(codec, bricks, &texels),
         };
-        Ok(kinds.iter().map(made).collect())
+        Ok(trials.iter().map(made).collect())
     }
 
     fn make_plain(&self, tree: &SequenceTree, id: u32, brick: &Brick, texels: &Texels) -> Plain {
@@ -410,26 +390,22 @@ impl EncoderCache {
             ConstantAim::Max => f64::midpoint(range.min.into(), range.max.into()) as f32,
         };
         let measure = self.measure(brick, &texels.texel_mask);
-        // Values just past the greatest half would round to it, but the codec refuses them.
-        let f16 = match brick.values.iter().all(|v| v.abs() <= f16::MAX.to_f32()) {
-            true => {
-                let (mut halves, mut back) = ([f16::ZERO; BRICK_VOXELS], [0.0; BRICK_VOXELS]);
-                halves.convert_from_f32_slice(&brick.values);
-                halves.convert_to_f32_slice(&mut back);
-                measure.of(&back, None)
-            }
-            false => Cost::IMPOSSIBLE,
-        };
+        let error_only = TexelCodec::ERROR_ONLY.map(|codec| {
+            let rounded = codec.round(&brick.values);
+            rounded.map_or(Cost::IMPOSSIBLE, |rounded| measure.of(&rounded, None))
+        });
         // Only where nothing but values says what is active may background stand for them.
         let empty = match brick.keeps_mask {
             true => Cost::IMPOSSIBLE,
             false => measure.of(&[tree.background; BRICK_VOXELS], None),
         };
-        Plain { value, constant: measure.of(&[value; BRICK_VOXELS], None), empty, f16 }
+        Plain { value, constant: measure.of(&[value; BRICK_VOXELS], None), empty, error_only }
     }
 
-    fn make_texels(&self, codec: Codec, bricks: &[Brick], texels: &[Texels]) -> Made {
-        let encoded = encode(codec, &self.sequence, texels).expect("only f16 has values that it cannot hold");
+    fn make_texels(&self, codec: TexelCodec, bricks: &[Brick], texels: &[Texels]) -> TrialResults {
+        let encoded =
+            encode(codec, &self.sequence, texels).expect("codecs whose texels are kept hold any value");
+        let codec = codec.codec();
         let size = codec.layout().brick_bytes();
         let each = bricks.iter().zip(texels).zip(encoded.bytes.chunks_exact(size)).zip(&encoded.axes);
         let note = |(((brick, texels), bytes), &axis): (((&Brick, &Texels), &[u8]), &u8)| {
@@ -437,7 +413,7 @@ impl EncoderCache {
             let spread = spread(codec, bytes, &self.sequence, texels.range);
             Note::new(self.measure(brick, &texels.texel_mask).of(&decoded, Some(&spread)), axis.into())
         };
-        Made { notes: each.map(note).collect(), texels: encoded.bytes }
+        TrialResults { notes: each.map(note).collect(), texels: encoded.bytes }
     }
 }
 
@@ -467,19 +443,19 @@ fn batches(tree: &SequenceTree) -> Vec<Batch> {
     all
 }
 
-/// What was made of some bricks in a kind, one brick after another.
+/// What was made of some bricks in a trial, one brick after another.
 #[derive(Default, Serialize, Deserialize)]
-pub struct Made {
-    /// [`Kind::notes`] a brick.
+pub struct TrialResults {
+    /// [`Trial::notes`] a brick.
     #[serde(with = "pods")]
     pub notes: Vec<Note>,
-    /// [`Kind::texels`] a brick.
+    /// [`Trial::texels`] a brick.
     #[serde(with = "pods")]
     pub texels: Vec<u8>,
 }
 
 /// What a codec made of some bricks.
-pub struct Tried {
+pub struct KeptBricks {
     /// What it does to each.
     pub costs: Vec<Cost>,
     /// Their texels, one after another.

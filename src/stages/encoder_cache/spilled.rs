@@ -2,7 +2,7 @@
 
 use bytemuck::{Pod, Zeroable};
 
-use super::{Cost, KeptCodec, Kind, Made};
+use super::{Cost, Trial, TrialResults};
 use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder, ScratchResult};
 
 /// A [`Cost`], and something more of what it is the cost of.
@@ -12,7 +12,7 @@ pub struct Note {
     error_l2: f64,
     active_error_l2: f64,
     max: f32,
-    /// What depends on the kind: a constant's value, a packing axis.
+    /// What depends on the trial: a constant's value, a packing axis.
     pub word: u32,
 }
 
@@ -28,20 +28,20 @@ impl Note {
     }
 }
 
-/// One kind of result for the bricks of a pool, each once: notes and texels.
+/// One trial of result for the bricks of a pool, each once: notes and texels.
 pub(super) struct Spilled {
     places: Places,
     notes: Scratch,
     texels: Option<Scratch>,
 }
 
-/// Where the results of each brick lie, as far as there are any. None are kept of a kind that nobody asks for.
+/// Where the results of each brick lie, as far as there are any. None are kept of a trial that nobody asks for.
 enum Places {
     /// At the brick's number; whether they do.
-    Own(Vec<bool>),
-    /// In the order in which they came, for a kind that is made for some bricks of a frame only: writes with gaps
+    ByBrick(Vec<bool>),
+    /// In the order in which they came, for a trial that is made for some bricks of a frame only: writes with gaps
     /// between them are slow.
-    Made {
+    InOrder {
         /// By brick.
         places: Vec<u32>,
         /// How many there are.
@@ -52,37 +52,37 @@ enum Places {
 const NOWHERE: u32 = u32::MAX;
 
 impl Places {
-    fn new(kind: Kind) -> Self {
-        match kind {
-            Kind::Texels(KeptCodec::Bc7) => Self::Made { places: Vec::new(), count: 0 },
-            _ => Self::Own(Vec::new()),
+    fn new(trial: Trial) -> Self {
+        match trial {
+            Trial::Texels(codec) if codec.is_on_demand() => Self::InOrder { places: Vec::new(), count: 0 },
+            _ => Self::ByBrick(Vec::new()),
         }
     }
 
     fn is_known(&self, id: u32) -> bool {
         match self {
-            Self::Own(known) => known.get(id as usize).is_some_and(|known| *known),
-            Self::Made { places, .. } => places.get(id as usize).is_some_and(|&place| place != NOWHERE),
+            Self::ByBrick(known) => known.get(id as usize).is_some_and(|known| *known),
+            Self::InOrder { places, .. } => places.get(id as usize).is_some_and(|&place| place != NOWHERE),
         }
     }
 
     /// Where a brick's lie that are there.
     fn of(&self, id: u32) -> u32 {
         match self {
-            Self::Own(_) => id,
-            Self::Made { places, .. } => places[id as usize],
+            Self::ByBrick(_) => id,
+            Self::InOrder { places, .. } => places[id as usize],
         }
     }
 
     /// Where a brick's shall lie, of a pool of `bricks`.
     fn take(&mut self, bricks: usize, id: u32) -> u32 {
         match self {
-            Self::Own(known) => {
+            Self::ByBrick(known) => {
                 known.resize(bricks, false);
                 known[id as usize] = true;
                 id
             }
-            Self::Made { places, count } => {
+            Self::InOrder { places, count } => {
                 places.resize(bricks, NOWHERE);
                 places[id as usize] = *count;
                 *count += 1;
@@ -93,12 +93,12 @@ impl Places {
 }
 
 impl Spilled {
-    /// Nothing yet of a kind.
-    pub fn new(scratch: &ScratchFolder, kind: Kind) -> Self {
+    /// Nothing yet of a trial.
+    pub fn new(scratch: &ScratchFolder, trial: Trial) -> Self {
         Self {
-            places: Places::new(kind),
-            notes: Scratch::new(scratch, kind.notes() * size_of::<Note>(), SCRATCH_SMALL),
-            texels: (kind.texels() > 0).then(|| Scratch::new(scratch, kind.texels(), 0)),
+            places: Places::new(trial),
+            notes: Scratch::new(scratch, trial.notes() * size_of::<Note>(), SCRATCH_SMALL),
+            texels: (trial.texels() > 0).then(|| Scratch::new(scratch, trial.texels(), 0)),
         }
     }
 
@@ -107,7 +107,7 @@ impl Spilled {
     }
 
     /// Keeps what was made of some bricks of a pool of `bricks`.
-    pub fn add(&mut self, bricks: usize, ids: &[u32], made: &Made) -> ScratchResult<()> {
+    pub fn add(&mut self, bricks: usize, ids: &[u32], made: &TrialResults) -> ScratchResult<()> {
         let places: Vec<u32> = ids.iter().map(|&id| self.places.take(bricks, id)).collect();
         let (mut notes, mut texels) = (bytemuck::cast_slice(&made.notes), &made.texels[..]);
         let put = |scratch: &mut Scratch, places: &[u32], records: &mut &[u8]| {

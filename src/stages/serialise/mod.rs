@@ -247,11 +247,8 @@ fn frame_slabs(grids: &[GridParts], placement: &Placement) -> Vec<Vec<Vec<u32>>>
 }
 
 /// What each codec cost a grid: the root of the squared error of its bricks over all frames, by tag.
-fn codec_error_l2s(
-    grid: &GridParts,
-    encoded: &EncodedGrid,
-) -> ScratchResult<[f32; Codec::WITH_TEXELS.len() + 1]> {
-    let mut squares = [0.0; Codec::WITH_TEXELS.len() + 1];
+fn codec_error_l2s(grid: &GridParts, encoded: &EncodedGrid) -> ScratchResult<[f32; Codec::COUNT]> {
+    let mut squares = [0.0; Codec::COUNT];
     for frame in &grid.tree.frames {
         for (id, square) in squares_of(grid, encoded, frame)? {
             squares[grid.allocation.codec(id) as usize] += square;

@@ -46,20 +46,31 @@ pub enum Codec {
 }
 
 impl Codec {
+    /// How many there are.
+    pub const COUNT: usize = TABLE.len();
+
     /// Every codec that has texels, in the order of their tags.
-    pub const WITH_TEXELS: [Self; 5] = [Self::Bc7, Self::Bc4, Self::Unorm8, Self::F16, Self::F32];
+    pub const WITH_TEXELS: [Self; Self::COUNT - 1] = {
+        let mut codecs = [Self::Constant; Self::COUNT - 1];
+        let mut i = 0;
+        while i < codecs.len() {
+            codecs[i] = TABLE[i + 1].codec;
+            i += 1;
+        }
+        codecs
+    };
 
     /// The codec with this tag.
     pub fn from_tag(tag: u32) -> Option<Self> {
-        [Self::Constant].into_iter().chain(Self::WITH_TEXELS).find(|c| *c as u32 == tag)
+        TABLE.get(tag as usize).map(|row| row.codec)
     }
 
-    fn row(self) -> &'static Row {
+    const fn row(self) -> &'static Row {
         &TABLE[self as usize]
     }
 
     /// Its name in manifests and reports.
-    pub fn name(self) -> &'static str {
+    pub const fn name(self) -> &'static str {
         self.row().name
     }
 
@@ -73,6 +84,11 @@ impl Codec {
         if self.row().has_axis { 0..=2 } else { 2..=2 }
     }
 
+    /// Whether texels lie in blocks, which an encoder fits to the values.
+    pub fn is_blocks(self) -> bool {
+        self.row().block_dim > 1
+    }
+
     /// Bytes of the words whose bytes are gathered before zstd; 1 for none.
     pub fn word_bytes(self) -> usize {
         self.row().word_bytes
@@ -83,13 +99,18 @@ impl Codec {
         self.row().texture
     }
 
+    /// Whether GPUs may decode it to values that differ from each other: see [`spread`].
+    pub fn varies_by_gpu(self) -> bool {
+        self.row().spread.is_some()
+    }
+
     /// What it promises of every voxel that its texels give.
     pub fn fidelity(self) -> Fidelity {
         self.row().fidelity
     }
 
     /// How one brick lies in a texture.
-    pub fn layout(self) -> BrickLayout {
+    pub const fn layout(self) -> BrickLayout {
         let Row { slices, block_dim, block_bytes, .. } = *self.row();
         BrickLayout { slices, rows: 8 / block_dim, row_bytes: 8 / block_dim * block_bytes }
     }
@@ -108,7 +129,7 @@ pub struct BrickLayout {
 
 impl BrickLayout {
     /// Bytes of one brick.
-    pub fn brick_bytes(&self) -> usize {
+    pub const fn brick_bytes(&self) -> usize {
         self.slices * self.rows * self.row_bytes
     }
 }

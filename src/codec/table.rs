@@ -1,0 +1,230 @@
+//! All that a build knows of each codec, beside what readers know of it ([`volpack_format::codec`]). A new one is a file
+//! with its encoder and a row here.
+
+use serde::{Serialize, Serializer};
+
+use super::{Codec, EncodedBricks, OutOfRange, SequenceRange, Texels, bc4, bc7, plain};
+use crate::volume::BRICK_VOXELS;
+
+type Voxels = [f32; BRICK_VOXELS];
+
+/// One codec that has texels.
+struct Row {
+    codec: Codec,
+    /// In the help of `--format`.
+    help: &'static str,
+    encode: fn(&SequenceRange, &[Texels]) -> Result<EncodedBricks, OutOfRange>,
+    cache: CachePolicy,
+    /// Of its bytes in the report, as CSS has it; from Okabe and Ito's palette.
+    color: &'static str,
+}
+
+/// When an adaptive build tries a codec on a brick, and what it keeps of that.
+#[derive(Clone, Copy)]
+pub enum CachePolicy {
+    /// On every brick. Texels and errors are kept on this machine.
+    Always,
+    /// On bricks for which the search would choose it, since it is slow. Texels and errors are kept, on remotes too.
+    OnDemand,
+    /// On every brick, by rounding values as its texels would; nothing for values that it cannot hold. Only errors are
+    /// kept: texels are as quick to make as to read back.
+    ErrorOnly(fn(&Voxels) -> Option<Voxels>),
+    /// On none: there is no error.
+    Exact,
+}
+
+/// By ascending bits; the last is exact.
+static TABLE: [Row; Codec::WITH_TEXELS.len()] = [
+    Row {
+        codec: Codec::Bc7,
+        help: "BC7 blocks, 2 bits per voxel",
+        encode: |sequence, bricks| Ok(bc7::encode(sequence, bricks)),
+        // Twenty times as long as all others together.
+        cache: CachePolicy::OnDemand,
+        color: "#009e73",
+    },
+    Row {
+        codec: Codec::Bc4,
+        help: "BC4 blocks, 4 bits per voxel",
+        encode: |sequence, bricks| {
+            Ok(EncodedBricks::without_axes(bc4::encode(sequence, bricks), bricks.len()))
+        },
+        cache: CachePolicy::Always,
+        color: "#0072b2",
+    },
+    Row {
+        codec: Codec::Unorm8,
+        help: "8 bits per voxel",
+        encode: |sequence, bricks| {
+            Ok(EncodedBricks::without_axes(plain::encode_unorm8(sequence, bricks), bricks.len()))
+        },
+        cache: CachePolicy::Always,
+        color: "#56b4e9",
+    },
+    Row {
+        codec: Codec::F16,
+        help: "16-bit floats, exact where the source is half",
+        encode: |_, bricks| Ok(EncodedBricks::without_axes(plain::encode_f16(bricks)?, bricks.len())),
+        cache: CachePolicy::ErrorOnly(plain::round_to_f16),
+        color: "#cc79a7",
+    },
+    Row {
+        codec: Codec::F32,
+        help: "32-bit floats, lossless",
+        encode: |_, bricks| Ok(EncodedBricks::without_axes(plain::encode_f32(bricks), bricks.len())),
+        cache: CachePolicy::Exact,
+        color: "#d55e00",
+    },
+];
+
+// The search takes the first that is good enough, and the last when none is.
+const _: () = {
+    let mut i = 0;
+    while i + 1 < TABLE.len() {
+        assert!(TABLE[i].codec.layout().brick_bytes() <= TABLE[i + 1].codec.layout().brick_bytes());
+        assert!(!matches!(TABLE[i].cache, CachePolicy::Exact));
+        i += 1;
+    }
+    assert!(matches!(TABLE[i].cache, CachePolicy::Exact));
+};
+
+/// A codec that has texels: one that a build can choose. In cache keys it is its tag less one.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TexelCodec(Codec);
+
+impl TexelCodec {
+    /// All of them, by ascending bits.
+    pub const ALL: [Self; TABLE.len()] = {
+        let mut all = [Self(Codec::Constant); TABLE.len()];
+        let mut i = 0;
+        while i < all.len() {
+            all[i] = Self(TABLE[i].codec);
+            i += 1;
+        }
+        all
+    };
+
+    /// BC7.
+    pub const BC7: Self = Self(Codec::Bc7);
+    /// BC4.
+    pub const BC4: Self = Self(Codec::Bc4);
+    /// One byte a voxel.
+    pub const UNORM8: Self = Self(Codec::Unorm8);
+    /// Half floats.
+    pub const F16: Self = Self(Codec::F16);
+    /// Floats.
+    pub const F32: Self = Self(Codec::F32);
+
+    /// The one without error, which any brick can have.
+    pub const EXACT: Self = Self::ALL[Self::ALL.len() - 1];
+
+    /// Those of [`CachePolicy::ErrorOnly`].
+    pub const ERROR_ONLY: [Self; Self::count_error_only()] = {
+        let mut found = [Self::EXACT; Self::count_error_only()];
+        let (mut i, mut next) = (0, 0);
+        while i < TABLE.len() {
+            if matches!(TABLE[i].cache, CachePolicy::ErrorOnly(_)) {
+                found[next] = Self(TABLE[i].codec);
+                next += 1;
+            }
+            i += 1;
+        }
+        found
+    };
+
+    const fn count_error_only() -> usize {
+        let (mut i, mut count) = (0, 0);
+        while i < TABLE.len() {
+            count += matches!(TABLE[i].cache, CachePolicy::ErrorOnly(_)) as usize;
+            i += 1;
+        }
+        count
+    }
+
+    /// For each tag, the place in [`Self::ALL`].
+    const PLACES: [usize; Codec::COUNT] = {
+        let mut places = [usize::MAX; Codec::COUNT];
+        let mut i = 0;
+        while i < TABLE.len() {
+            places[TABLE[i].codec as usize] = i;
+            i += 1;
+        }
+        places
+    };
+
+    /// A codec, if it has texels.
+    pub const fn of(codec: Codec) -> Option<Self> {
+        if Self::PLACES[codec as usize] < TABLE.len() { Some(Self(codec)) } else { None }
+    }
+
+    /// As one of all codecs.
+    pub const fn codec(self) -> Codec {
+        self.0
+    }
+
+    /// Its place in [`Self::ALL`].
+    pub const fn index(self) -> usize {
+        Self::PLACES[self.0 as usize]
+    }
+
+    fn row(self) -> &'static Row {
+        &TABLE[self.index()]
+    }
+
+    /// Its name in manifests and reports.
+    pub const fn name(self) -> &'static str {
+        self.0.name()
+    }
+
+    /// What the help says of it.
+    pub fn help(self) -> &'static str {
+        self.row().help
+    }
+
+    /// When adaptive builds try it, and what they keep of that.
+    pub fn cache_policy(self) -> CachePolicy {
+        self.row().cache
+    }
+
+    /// Whether its texels are kept once they are made.
+    pub fn keeps_texels(self) -> bool {
+        matches!(self.cache_policy(), CachePolicy::Always | CachePolicy::OnDemand)
+    }
+
+    /// Whether it is tried only on bricks for which the search would choose it.
+    pub fn is_on_demand(self) -> bool {
+        matches!(self.cache_policy(), CachePolicy::OnDemand)
+    }
+
+    /// Some values as its texels give them back: `None` where it cannot hold one.
+    ///
+    /// # Panics
+    /// For a codec that is not of [`CachePolicy::ErrorOnly`].
+    pub fn round(self, values: &Voxels) -> Option<Voxels> {
+        let CachePolicy::ErrorOnly(round) = self.cache_policy() else {
+            panic!("{} is tried with its encoder", self.name());
+        };
+        round(values)
+    }
+
+    /// The colour of its bytes in the report, as CSS has it.
+    pub fn color(self) -> &'static str {
+        self.row().color
+    }
+
+    /// Encodes some bricks, on this thread.
+    pub(super) fn encode_batch(
+        self,
+        sequence: &SequenceRange,
+        bricks: &[Texels],
+    ) -> Result<EncodedBricks, OutOfRange> {
+        (self.row().encode)(sequence, bricks)
+    }
+}
+
+impl Serialize for TexelCodec {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        // What the keys of caches have had since codecs were first kept.
+        serializer.serialize_u32(self.0 as u32 - 1)
+    }
+}
