@@ -6,7 +6,7 @@ use bytemuck::{Pod, Zeroable};
 use hashbrown::HashTable;
 use xxhash_rust::xxh3::{xxh3_64, xxh3_128};
 
-use super::{BRICK_VOXELS, Brick, List, Mask512, SCRATCH_SMALL, Scratch, ScratchFolder, ScratchResult};
+use super::{BRICK_VOXELS, Brick, ChunkedVec, Mask512, SCRATCH_SMALL, Scratch, ScratchFolder, ScratchResult};
 
 /// Bricks that are worked on before what was made of them is put away: enough batches of an encoder for every core.
 pub const BRICKS_IN_FLIGHT: u32 = 4096;
@@ -18,8 +18,8 @@ pub const BRICKS_IN_FLIGHT: u32 = 4096;
 pub struct BrickPool {
     by_digest: HashTable<u32>,
     /// The first bytes of each digest. The rest of it is looked at where these are the same.
-    starts: List<u64>,
-    bricks: List<Known>,
+    starts: ChunkedVec<u64>,
+    bricks: ChunkedVec<Known>,
     facts: Scratch,
     values: Scratch,
 }
@@ -70,8 +70,8 @@ impl BrickPool {
     pub fn new(scratch: &ScratchFolder) -> Self {
         Self {
             by_digest: HashTable::new(),
-            starts: List::default(),
-            bricks: List::default(),
+            starts: ChunkedVec::default(),
+            bricks: ChunkedVec::default(),
             facts: Scratch::new(scratch, size_of::<Facts>(), SCRATCH_SMALL),
             values: Scratch::new(scratch, BRICK_VOXELS * 4, 0),
         }
@@ -146,7 +146,7 @@ impl BrickPool {
     /// When the scratch file cannot be written.
     pub fn seal(&mut self) -> ScratchResult<()> {
         self.by_digest = HashTable::new();
-        self.starts = List::default();
+        self.starts = ChunkedVec::default();
         self.facts.flush()?;
         self.values.flush()
     }

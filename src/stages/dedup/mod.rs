@@ -14,7 +14,7 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 use crate::volume::{
-    Blocks, Brick, BrickPool, CellContent, Child, Constant, Coord, FrameStats, InactiveRule, Interner, List,
+    Brick, BrickPool, CellContent, Child, ChunkedVec, Constant, Coord, FrameStats, InactiveRule, Interner,
     Mask512, ScratchError, ScratchFolder, ScratchResult, SortedMap, ValueRange, bits,
 };
 
@@ -32,13 +32,13 @@ pub struct SequenceTree {
     /// Runs of entries that [`SequenceTree::record`] understands, one run a distinct list of children.
     pub runs: Interner<u32>,
     /// The distinct L3 records of which more is to be said than which brick they are.
-    records: List<Record>,
+    records: ChunkedVec<Record>,
     /// The distinct masks. A mask of signs follows the mask it belongs to.
     pub masks: Interner<Mask512>,
     /// The distinct bricks.
     pub pool: BrickPool,
     /// For each brick of the pool, the range of the values that its texels carry.
-    pub brick_ranges: List<ValueRange>,
+    pub brick_ranges: ChunkedVec<ValueRange>,
     /// For each frame, the bricks of the pool that it had first.
     pub own_bricks: Vec<Range<u32>>,
     /// Where what does not fit in memory is.
@@ -51,7 +51,7 @@ pub struct SequenceTree {
 }
 
 /// Reads the bricks of a frame.
-pub type Read = dyn Fn(usize) -> Result<Blocks<Brick>> + Send + Sync;
+pub type Read = dyn Fn(usize) -> Result<ChunkedVec<Brick>> + Send + Sync;
 
 /// The way to a frame's voxels.
 pub struct Fetch {
@@ -160,10 +160,10 @@ impl SequenceTree {
             frames: Vec::new(),
             nodes: Nodes::new(&scratch),
             runs: Interner::default(),
-            records: List::default(),
+            records: ChunkedVec::default(),
             masks: Interner::default(),
             pool: BrickPool::new(&scratch),
-            brick_ranges: List::default(),
+            brick_ranges: ChunkedVec::default(),
             own_bricks: Vec::new(),
             scratch,
             fetch,
@@ -189,7 +189,11 @@ impl SequenceTree {
     ///
     /// # Errors
     /// [`DedupError`].
-    pub fn add(&mut self, frame_index: FrameIndex, voxels: Option<Blocks<Brick>>) -> Result<(), DedupError> {
+    pub fn add(
+        &mut self,
+        frame_index: FrameIndex,
+        voxels: Option<ChunkedVec<Brick>>,
+    ) -> Result<(), DedupError> {
         self.check_background(&frame_index)?;
         let first = self.pool.len();
         let mut cells = Vec::with_capacity(frame_index.cells.len());
@@ -225,7 +229,7 @@ impl SequenceTree {
     }
 
     /// Puts the voxels of a frame's own bricks into the pool.
-    fn put_voxels(&mut self, frame: usize, voxels: &Blocks<Brick>) -> ScratchResult<()> {
+    fn put_voxels(&mut self, frame: usize, voxels: &ChunkedVec<Brick>) -> ScratchResult<()> {
         for id in self.own_bricks[frame].clone() {
             if !self.pool.is_there(id) {
                 self.pool.put(id, &voxels[self.pool.place(id)].values)?;
@@ -235,7 +239,7 @@ impl SequenceTree {
     }
 
     /// The same for voxels that were fetched for a frame index from elsewhere: they must be those that it tells of.
-    fn put_fetched(&mut self, frame: usize, voxels: &Blocks<Brick>) -> Result<()> {
+    fn put_fetched(&mut self, frame: usize, voxels: &ChunkedVec<Brick>) -> Result<()> {
         let own: Vec<u32> = self.own_bricks[frame].clone().collect();
         let digests = self.pool.digests(&own)?;
         let pool = &self.pool;
