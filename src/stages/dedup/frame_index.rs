@@ -165,18 +165,18 @@ impl IndexedBrick {
         };
         brick.keeps_mask = !(drop && rule == InactiveRule::Background);
         let rule = if brick.keeps_mask { rule } else { InactiveRule::Texel };
-        let mut frame_index = Self { active: brick.active, ..Self::zeroed() };
-        frame_index.flags = rule as u32 | if brick.keeps_mask { KEEPS_MASK } else { 0 };
+        let mut indexed = Self { active: brick.active, ..Self::zeroed() };
+        indexed.flags = rule as u32 | if brick.keeps_mask { KEEPS_MASK } else { 0 };
         match values(brick, &texel_mask(&brick.active, rule), background) {
             Values::Constant(value) => {
-                frame_index.flags |= IS_CONSTANT;
-                (frame_index.min, frame_index.max) = (value, value);
+                indexed.flags |= IS_CONSTANT;
+                (indexed.min, indexed.max) = (value, value);
             }
             Values::Varied(range, digest) => {
-                (frame_index.min, frame_index.max, frame_index.digest) = (range.min, range.max, digest);
+                (indexed.min, indexed.max, indexed.digest) = (range.min, range.max, digest);
             }
         }
-        (frame_index, (rule == InactiveRule::Sign).then_some(sign_mask))
+        (indexed, (rule == InactiveRule::Sign).then_some(sign_mask))
     }
 }
 
