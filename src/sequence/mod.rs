@@ -111,8 +111,8 @@ pub struct Sequence {
     pub after: String,
     /// The files in the order of their frames; at least one.
     pub files: Vec<PathBuf>,
-    /// Globs for the frame number, one for each length of it. They have a class for each digit and no `*`, which would match
-    /// `smoke_low_0001.vdb` together with `smoke_0001.vdb`.
+    /// Globs for the frame number: one for each number of digits, and for each sign or point among them. They have a class
+    /// for each digit and no `*`, which would match `smoke_low_0001.vdb` together with `smoke_0001.vdb`.
     pub number_globs: Vec<String>,
 }
 
