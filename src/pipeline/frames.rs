@@ -16,7 +16,7 @@ use crate::stages::flatten::{Flattened, flatten};
 use crate::stages::metadata::{FrameSource, SequenceInfo};
 use crate::stages::select::{SelectedGrid, Selection};
 use crate::vdb::{GridClass, VdbFile, find_grid};
-use crate::volume::{Blocks, Brick, FlatFrame};
+use crate::volume::{Brick, ChunkedVec, FlatFrame};
 
 /// What frames pass through before anything is made of them.
 pub type Alter<'a> = &'a (dyn Fn(&mut FlatFrame) + Sync);
@@ -24,7 +24,7 @@ pub type Alter<'a> = &'a (dyn Fn(&mut FlatFrame) + Sync);
 const OUTLINE: Namespace = Namespace { name: "outline", version: 4, travels: false };
 
 /// One grid of one frame, with its voxels unless they were not needed so far.
-type Frame = (FrameIndex, Option<Blocks<Brick>>);
+type Frame = (FrameIndex, Option<ChunkedVec<Brick>>);
 
 /// Reads frames and adds them in order: while some are added the next are read, as many as memory
 /// has room for.

@@ -1,151 +1,29 @@
 //! The CPU tracer.
 //!
 //! In `f64` with [`Traversal::Dda`] it is the reference; in `f32` with [`Traversal::Hdda`] it is the
-//! shader's twin, line by line (`shaders/tracer.wgsl`).
+//! shader's twin, line by line (`shaders/tracer.wgsl`). It is one file, as the shader is, so that the two can be read side
+//! by side.
 
 use rayon::prelude::*;
 
-use super::camera::{Camera, Lens, View, WorldBox, apply3, dot, invert3, length, normalise};
+use super::camera::{dot, normalise};
 use super::decoded_frame::{Content, DecodedFrame};
 use super::image::{Image, apart, opacity};
+pub(super) use super::scene::{AMBIENT, Scene, Setup, TraceError};
 use super::surface::{cubic, evaluate, first_change};
-use super::traverse::{Box3, MAX_CELL, Ray, Real, Walk};
-use super::{Interpolation, Mode, Traversal};
-use crate::pack::Grid;
-use crate::volume::{Coord, CoordBox, ROOT_DIM};
+use super::traverse::{Box3, Ray, Real, Walk};
+use super::{Mode, Traversal};
+use crate::volume::{Coord, ROOT_DIM};
 
-/// What is traced, and how it looks.
-#[derive(Clone, Copy, Debug)]
-pub struct Scene {
-    /// What a picture shows.
-    pub mode: Mode,
-    /// How rays step.
-    pub traversal: Traversal,
-    /// Where it is taken from.
-    pub camera: Camera,
-    /// Width and height in pixels.
-    pub size: [u32; 2],
-    /// Index space to world space.
-    pub matrix: [f64; 16],
-    /// Whether the grid's zero is a surface.
-    pub level_set: bool,
-    /// And between which values.
-    pub interpolation: Interpolation,
-    /// Optical depth of a density of 1 over a world unit.
-    pub extinction: f64,
-    /// Densities above this are a hit.
-    pub threshold: f32,
-}
-
-/// Optical depth through a whole box at its highest density: dense enough to see a surface, thin enough
-/// to see into it.
-const BOX_DEPTH: f64 = 24.0;
-/// Densities above this part of the highest are a hit.
-const HIT_DENSITY: f32 = 0.05;
-
-impl Scene {
-    /// A picture of a frame of a pack, or of its source. Camera, extinction and threshold are one for all frames of the
-    /// grid and come from what its tables say of the source, so packs of one source are pictured alike whatever they lost.
-    ///
-    /// # Panics
-    /// When there is no such frame.
-    pub fn new(grid: &Grid, frame: usize, view: &View, mode: Mode, size: [u32; 2]) -> Self {
-        let bounds = WorldBox::of_grid(grid);
-        // What is below 0 absorbs nothing.
-        let densest = grid.record.active_max.max(0.0);
-        let depth = bounds.diagonal() * f64::from(densest);
-        Self {
-            mode,
-            traversal: Traversal::default(),
-            camera: view.camera(&bounds),
-            size,
-            matrix: grid.frames[frame].record.transform,
-            level_set: grid.is_level_set(),
-            interpolation: Interpolation::default(),
-            extinction: if depth > 0.0 { BOX_DEPTH / depth } else { 0.0 },
-            threshold: HIT_DENSITY * densest,
-        }
-    }
-
-    /// Whether cells lie between voxels, which are their corners; else they are voxels.
-    fn is_trilinear(&self) -> bool {
-        self.level_set && self.interpolation == Interpolation::Trilinear
-    }
-}
-
-/// Towards the sun, in world space.
-const SUN: [f64; 3] = [0.48, 0.80, 0.36];
-/// Light that reaches shadows.
-pub const AMBIENT: f64 = 0.15;
-/// A shadow ray begins this many cells off the surface, so that the surface does not shade itself.
-const SHADOW_OFFSET: f64 = 1.5;
 /// Steps after which a ray is given up: more than any box in view has cells across.
 const MAX_STEPS: u32 = 1 << 16;
-
-/// Why a frame cannot be traced.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum TraceError {
-    /// The scene's matrix has no inverse.
-    #[error("the grid's transform cannot be inverted")]
-    Transform,
-    /// The box of what is not background is too wide for the tracers' arithmetic.
-    #[error("its voxels lie in a box {0} voxels wide, and pictures are drawn of at most {MAX_CELL}")]
-    TooWide(i64),
-}
-
-/// What does not depend on the pixel, as both tracers take it. Cells are counted from `base`, so that
-/// an `f32` has as many bits for a volume far from the origin as for one around it.
-pub struct Setup {
-    /// The voxel that cell 0 is.
-    pub base: [i32; 3],
-    /// The cells to trace.
-    pub bounds: Box3,
-    /// The camera's rays.
-    pub lens: Lens,
-    /// Towards the sun, in cell space, as long as shadow rays begin off the surface.
-    pub sun: [f64; 3],
-    /// For a gradient in cell space, rows whose products are the normal in world space.
-    pub normals: [[f64; 3]; 3],
-    /// Towards the sun, in world space.
-    pub sun_world: [f64; 3],
-}
-
-impl Setup {
-    /// `voxels` is the box of everything that is not background.
-    ///
-    /// # Errors
-    /// [`TraceError`].
-    pub fn new(scene: &Scene, voxels: CoordBox) -> Result<Self, TraceError> {
-        let (base, size) = if voxels.is_empty() {
-            ([0; 3], [0; 3])
-        } else {
-            let size = |a: usize| i64::from(voxels.max.0[a]) - i64::from(voxels.min.0[a]) + 1;
-            (voxels.min.0, std::array::from_fn(size))
-        };
-        if let Some(wide) = size.into_iter().find(|size| *size > i64::from(MAX_CELL)) {
-            return Err(TraceError::TooWide(wide));
-        }
-        let bounds = Box3 { min: [0; 3], max: size.map(|size| size as i32) };
-        let bounds = if scene.is_trilinear() { bounds.grown() } else { bounds };
-        let shift = if scene.is_trilinear() { 0.0 } else { 0.5 };
-        let shift = base.map(|b| shift - f64::from(b));
-        let lens = Lens::new(&scene.camera, &scene.matrix, scene.size, shift).ok_or(TraceError::Transform)?;
-        // world = index · M, so gradients go by the inverse transposed: row r of it is what index
-        // axis a has of world axis r.
-        let inverse = invert3(&scene.matrix).ok_or(TraceError::Transform)?;
-        let sun_world = normalise(SUN);
-        let sun = apply3(&inverse, sun_world);
-        let sun = sun.map(|v| v * SHADOW_OFFSET / length(sun));
-        Ok(Self { base, bounds, lens, sun, normals: inverse, sun_world })
-    }
-}
 
 /// Traces a picture: four numbers a pixel, of which the last is the steps taken.
 ///
 /// # Errors
 /// [`TraceError`].
-pub fn trace<F: Real>(field: &DecodedFrame, scene: &Scene) -> Result<Image, TraceError> {
-    Ok(trace_noting_bc4::<F>(field, scene)?.0)
+pub fn trace<F: Real>(frame: &DecodedFrame, scene: &Scene) -> Result<Image, TraceError> {
+    Ok(trace_noting_bc4::<F>(frame, scene)?.0)
 }
 
 /// The same, and for each pixel whether its rays read a brick of BC4, whose values are each GPU's own.
@@ -153,11 +31,11 @@ pub fn trace<F: Real>(field: &DecodedFrame, scene: &Scene) -> Result<Image, Trac
 /// # Errors
 /// [`TraceError`].
 pub fn trace_noting_bc4<F: Real>(
-    field: &DecodedFrame,
+    frame: &DecodedFrame,
     scene: &Scene,
 ) -> Result<(Image, Vec<bool>), TraceError> {
-    let setup = Setup::new(scene, field.bounds)?;
-    let tracer = Tracer::<F>::new(field, scene, &setup);
+    let setup = Setup::new(scene, frame.bounds)?;
+    let tracer = Tracer::<F>::new(frame, scene, &setup);
     let [width, height] = scene.size;
     let pixels = (0..width * height).into_par_iter().map(|i| tracer.pixel(i % width, i / width));
     let (pixels, reads_bc4) = pixels.unzip();
@@ -170,14 +48,14 @@ pub fn trace_noting_bc4<F: Real>(
 ///
 /// # Errors
 /// [`TraceError`].
-pub fn spread(field: &DecodedFrame, scene: &Scene, pixels: &[usize]) -> Result<Vec<f32>, TraceError> {
-    let setup = Setup::new(scene, field.bounds)?;
-    let tracer = Tracer::<f32>::new(field, scene, &setup);
+pub fn spread(frame: &DecodedFrame, scene: &Scene, pixels: &[usize]) -> Result<Vec<f32>, TraceError> {
+    let setup = Setup::new(scene, frame.bounds)?;
+    let tracer = Tracer::<f32>::new(frame, scene, &setup);
     let width = scene.size[0] as usize;
     let spread = |&pixel: &usize| {
         let [x, y] = [pixel % width, pixel / width].map(|v| v as u32);
         let (still, _) = tracer.pixel(x, y);
-        let moved = (0..WAYS).map(|way| Tracer { way: Some(way), ..tracer }.pixel(x, y).0);
+        let moved = (0..PERTURBATIONS).map(|p| Tracer { perturbation: Some(p), ..tracer }.pixel(x, y).0);
         // Numbers are no further than 2 apart; what is none is no number on any GPU.
         moved.map(|moved| apart(&still[..3], &moved[..3])).fold(0.0, f32::max).min(2.0)
     };
@@ -188,9 +66,9 @@ pub fn spread(field: &DecodedFrame, scene: &Scene, pixels: &[usize]) -> Result<V
 ///
 /// # Errors
 /// [`TraceError`].
-pub fn optical_depths<F: Real>(field: &DecodedFrame, scene: &Scene) -> Result<Vec<f32>, TraceError> {
-    let setup = Setup::new(scene, field.bounds)?;
-    let tracer = Tracer::<F> { extinction: F::from_i32(1), ..Tracer::new(field, scene, &setup) };
+pub fn optical_depths<F: Real>(frame: &DecodedFrame, scene: &Scene) -> Result<Vec<f32>, TraceError> {
+    let setup = Setup::new(scene, frame.bounds)?;
+    let tracer = Tracer::<F> { extinction: F::from_i32(1), ..Tracer::new(frame, scene, &setup) };
     let [width, height] = scene.size;
     let depth = |i| {
         let ray = tracer.ray(i % width, i / width);
@@ -208,17 +86,19 @@ struct Visited {
 
 #[derive(Clone, Copy)]
 struct Tracer<'a, F> {
-    field: &'a DecodedFrame,
+    frame: &'a DecodedFrame,
     scene: &'a Scene,
     setup: &'a Setup,
     extinction: F,
-    /// In which of [`WAYS`] rays and values are moved: a bit for each axis, and one for the sign of [`pattern`].
-    way: Option<u32>,
+    /// Which of the [`PERTURBATIONS`] moves rays and values: a bit for each axis, and one for the sign of
+    /// [`perturbation_sign`].
+    perturbation: Option<u32>,
 }
 
-/// How many roundings a ray is moved by, of its farthest coordinate (two for its origin, one for how far along it a place
-/// is, one for what is counted from there), and a cell's corners, of the largest (in sums of four and eight of them).
-const ROUNDINGS: f32 = 4.0 * f32::EPSILON;
+/// What rounding moves a ray by, as a part of its farthest coordinate, and a cell's corners, as a part of the largest. A ray
+/// has four roundings: two for its origin, one for how far along it a place is, and one for what is counted from there. A
+/// cell's corners are summed by four and by eight.
+const ROUNDING_ERROR: f32 = 4.0 * f32::EPSILON;
 
 /// Where a ray first hits something.
 struct Hit<F> {
@@ -232,18 +112,19 @@ struct Hit<F> {
 }
 
 impl<'a, F: Real> Tracer<'a, F> {
-    fn new(field: &'a DecodedFrame, scene: &'a Scene, setup: &'a Setup) -> Self {
-        Self { field, scene, setup, extinction: F::from_f64(scene.extinction), way: None }
+    fn new(frame: &'a DecodedFrame, scene: &'a Scene, setup: &'a Setup) -> Self {
+        Self { frame, scene, setup, extinction: F::from_f64(scene.extinction), perturbation: None }
     }
 
     fn ray(&self, x: u32, y: u32) -> Ray<F> {
         let [width, height] = self.scene.size;
         let at = |i: u32, n: u32| (2.0 * f64::from(i) + 1.0) / f64::from(n) - 1.0;
         let ray: Ray<F> = self.setup.lens.ray(at(x, width), -at(y, height));
-        let Some(way) = self.way else { return ray };
+        let Some(perturbation) = self.perturbation else { return ray };
         let farthest = ray.origin.iter().map(|v| v.to_f64().abs()).fold(1.0, f64::max);
-        let by = F::from_f64(farthest * f64::from(ROUNDINGS));
-        let origin = std::array::from_fn(|a| ray.origin[a] + if way >> a & 1 == 1 { by } else { -by });
+        let by = F::from_f64(farthest * f64::from(ROUNDING_ERROR));
+        let origin =
+            std::array::from_fn(|a| ray.origin[a] + if perturbation >> a & 1 == 1 { by } else { -by });
         Ray::new(origin, ray.direction)
     }
 
@@ -276,13 +157,17 @@ impl<'a, F: Real> Tracer<'a, F> {
     /// it has one value, and the value of the cell's voxel.
     fn node(&self, cell: [i32; 3], visited: &mut Visited) -> (Box3, bool, f32) {
         let voxel = self.voxel(cell);
-        let found = self.field.find(voxel);
+        let found = self.frame.find(voxel);
         let (constant, value) = match found.content {
             Content::Constant(constant) => (true, constant.value),
             Content::Brick(brick) => {
                 visited.reads_bc4 |= brick.uncertainty > 0.0;
                 let value = brick.values[voxel.child_index(3, 1)];
-                (false, value + self.way.map_or(0.0, |way| brick.uncertainty * pattern(way, voxel)))
+                (
+                    false,
+                    value
+                        + self.perturbation.map_or(0.0, |p| brick.uncertainty * perturbation_sign(p, voxel)),
+                )
             }
         };
         if constant && self.skips() {
@@ -345,7 +230,7 @@ impl<'a, F: Real> Tracer<'a, F> {
     /// Whether it is negative where a walk comes from: the background is, or is not; nothing is known of where a ray
     /// begins inside.
     fn sign_before(&self, walk: &Walk<F>) -> Option<bool> {
-        (walk.axis < 3).then_some(self.field.background < 0.0)
+        (walk.axis < 3).then_some(self.frame.background < 0.0)
     }
 
     /// The first zero of the interpolated field. A cell reaches over to the next voxel on each axis, so
@@ -361,7 +246,7 @@ impl<'a, F: Real> Tracer<'a, F> {
         while bounds.contains(walk.cell) && visited.steps < MAX_STEPS {
             visited.steps += 1;
             let (node, constant, value) = self.node(walk.cell, visited);
-            let alone = constant && self.skips() && self.field.is_alone(self.voxel(walk.cell));
+            let alone = constant && self.skips() && self.frame.is_alone(self.voxel(walk.cell));
             let inner = Box3 { min: node.min, max: node.max.map(|v| v - i32::from(!alone)) };
             if constant && inner.contains(walk.cell) {
                 let sign = value < 0.0;
@@ -385,7 +270,7 @@ impl<'a, F: Real> Tracer<'a, F> {
             let (exit, _) = walk.exit(ray, cell);
             let from = self.local(ray, walk.cell, walk.t);
             let along = std::array::from_fn(|a| ray.direction[a] * (exit - walk.t));
-            let c = cubic(self.moved(corners, walk.cell), from, along);
+            let c = cubic(self.perturbed(corners, walk.cell), from, along);
             let start = *negative.get_or_insert(evaluate(c, F::from_i32(0)) < F::from_i32(0));
             if is_mixed(start)
                 && let Some(u) = first_change(c, start)
@@ -412,17 +297,18 @@ impl<'a, F: Real> Tracer<'a, F> {
     }
 
     /// A cell's corners, moved by what is rounded where sums of them are.
-    fn moved(&self, corners: [F; 8], cell: [i32; 3]) -> [F; 8] {
-        let Some(way) = self.way else { return corners };
+    fn perturbed(&self, corners: [F; 8], cell: [i32; 3]) -> [F; 8] {
+        let Some(perturbation) = self.perturbation else { return corners };
         let largest = corners.iter().map(|v| v.to_f64().abs()).fold(0.0, f64::max);
         std::array::from_fn(|i| {
             let corner = Coord(std::array::from_fn(|a| cell[a] + (i >> a & 1) as i32));
-            corners[i] + F::from_f64(largest * f64::from(ROUNDINGS * pattern(way, corner)))
+            corners[i]
+                + F::from_f64(largest * f64::from(ROUNDING_ERROR * perturbation_sign(perturbation, corner)))
         })
     }
 
     fn surface_hit(&self, ray: &Ray<F>, walk: &Walk<F>, t: F, visited: &mut Visited) -> Hit<F> {
-        let c = self.moved(self.corners(walk.cell, visited), walk.cell).map(Real::to_f64);
+        let c = self.perturbed(self.corners(walk.cell, visited), walk.cell).map(Real::to_f64);
         let p = self.local(ray, walk.cell, t).map(|v| v.to_f64().clamp(0.0, 1.0));
         let gradient: [f64; 3] = std::array::from_fn(|a| {
             (0..8)
@@ -501,13 +387,14 @@ impl<'a, F: Real> Tracer<'a, F> {
 const NODE_COLORS: [(i32, f64, [f32; 3]); 3] =
     [(ROOT_DIM, 1.0, [0.1, 0.2, 1.0]), (128, 0.75, [1.0, 0.15, 0.1]), (8, 0.5, [0.0, 0.9, 0.9])];
 
-const WAYS: u32 = 16;
+/// The combinations of the four bits of a perturbation.
+const PERTURBATIONS: u32 = 16;
 
-/// 1 or -1, changing along the axes of `way`: by these patterns the corners of a cell are moved in all ways that change
-/// where its zero is or how steep it is.
-fn pattern(way: u32, voxel: Coord) -> f32 {
-    let odd = (0..3).filter(|&a| way >> a & 1 == 1 && voxel.0[a] & 1 == 1).count();
-    if (odd % 2 == 1) != (way >> 3 == 1) { -1.0 } else { 1.0 }
+/// 1 or -1, changing along the axes of `perturbation`: with these signs the corners of a cell are moved in all ways that
+/// change where its zero is or how steep it is.
+fn perturbation_sign(perturbation: u32, voxel: Coord) -> f32 {
+    let odd = (0..3).filter(|&a| perturbation >> a & 1 == 1 && voxel.0[a] & 1 == 1).count();
+    if (odd % 2 == 1) != (perturbation >> 3 == 1) { -1.0 } else { 1.0 }
 }
 
 /// A hue that differs between neighbouring bricks: the same bits in the shader.

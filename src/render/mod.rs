@@ -15,14 +15,16 @@ mod decoded_frame;
 pub mod gpu;
 mod image;
 mod renderer;
+mod scene;
 mod surface;
 mod traverse;
 
 pub use camera::{Camera, CameraError, Lens, View, WorldBox};
-pub use cpu::{Scene, TraceError, optical_depths, spread, trace, trace_noting_bc4};
+pub use cpu::{optical_depths, spread, trace, trace_noting_bc4};
 pub use decoded_frame::DecodedFrame;
 pub use image::{Difference, Image, apart, difference, write_apng, write_png};
 pub use renderer::{Device, Renderer};
+pub use scene::{Scene, TraceError};
 pub use traverse::{Box3, Ray, Real, Walk};
 
 use clap::ValueEnum;

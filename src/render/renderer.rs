@@ -3,10 +3,11 @@
 use clap::ValueEnum;
 use serde::Serialize;
 
-use super::cpu::{Scene, trace};
+use super::cpu::trace;
 use super::decoded_frame::DecodedFrame;
 use super::gpu::{Gpu, GpuError, Uploaded};
 use super::image::Image;
+use super::scene::Scene;
 use crate::pack::{FrameReader, Pack};
 
 /// What traces a picture.

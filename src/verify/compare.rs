@@ -3,6 +3,7 @@
 use rayon::prelude::*;
 
 use super::Reading;
+use super::frame_error::{FrameError, error_bin};
 use super::promise::Promise;
 use crate::codec::{BrickRange, Codec, Fidelity};
 use crate::pack::{FrameReader, Region};
@@ -12,106 +13,6 @@ use crate::volume::{
     BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, InactiveRule, Mask512, ROOT_DIM, ValueRange,
 };
 
-/// Codecs, constants among them, by their tags.
-pub(super) const CODECS: usize = Codec::WITH_TEXELS.len() + 1;
-
-/// Squared errors of some voxels.
-#[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Error {
-    pub voxels: u64,
-    pub squares: f64,
-    pub max: f64,
-    pub sign_flips: u64,
-}
-
-impl Error {
-    pub fn add(&mut self, other: &Self) {
-        self.voxels += other.voxels;
-        self.squares += other.squares;
-        self.max = self.max.max(other.max);
-        self.sign_flips += other.sign_flips;
-    }
-
-    fn voxel(&mut self, error: f64, flipped: bool) {
-        self.voxels += 1;
-        self.squares += error * error;
-        // What is no number is no small error.
-        self.max = if error.is_nan() { f64::INFINITY } else { self.max.max(error.abs()) };
-        self.sign_flips += u64::from(flipped);
-    }
-}
-
-/// Bins of [`Histogram`]: no error, below 2⁻¹⁵ of the range, fourteen octaves, and half of the range and more.
-pub const ERROR_BINS: usize = 17;
-
-/// How many voxels have an error of 0, of less than 2⁻¹⁵ of the range of values, and so on by octaves to 2⁻¹ and more.
-pub type Histogram = [u64; ERROR_BINS];
-
-/// The bin of an error, as a fraction of the range.
-fn bin(error: f64) -> usize {
-    if error == 0.0 {
-        return 0;
-    }
-    // The octave is the float's exponent; infinities and NaNs have the greatest.
-    let octave = (error.to_bits() >> 52 & 0x7ff) as i32 - 1023;
-    (octave + ERROR_BINS as i32).clamp(1, ERROR_BINS as i32 - 1) as usize
-}
-
-/// What differs in one frame.
-#[derive(Clone, Debug, Default)]
-pub(super) struct FrameError {
-    /// Over active leaf voxels, in the source's own type.
-    pub active: Error,
-    /// The same over all leaf voxels.
-    pub all: Error,
-    /// Of active leaf voxels.
-    pub histogram: Histogram,
-    /// The range of the source's active values, tiles included.
-    pub active_range: Option<ValueRange>,
-    /// Active voxels of the source, tiles in full.
-    pub active_voxels: u64,
-    /// Whether the pack has anything but background.
-    pub has_regions: bool,
-    /// Squared error over the voxels that texels give, by the codec that gives them, against the nearest floats of the
-    /// source: what the encoder saw.
-    pub codec_squares: [f64; CODECS],
-    /// Squared error over active leaf voxels, likewise.
-    pub active_float_squares: f64,
-    failures: u64,
-    first_failure: Option<String>,
-}
-
-impl FrameError {
-    fn fail(&mut self, what: impl FnOnce() -> String) {
-        self.failures += 1;
-        self.first_failure.get_or_insert_with(what);
-    }
-
-    fn add(&mut self, other: Self) {
-        self.active.add(&other.active);
-        self.all.add(&other.all);
-        self.histogram.iter_mut().zip(other.histogram).for_each(|(sum, count)| *sum += count);
-        self.codec_squares.iter_mut().zip(other.codec_squares).for_each(|(sum, squares)| *sum += squares);
-        self.active_float_squares += other.active_float_squares;
-        self.active_range = ValueRange::union_all(self.active_range.into_iter().chain(other.active_range));
-        self.failures += other.failures;
-        self.first_failure = self.first_failure.take().or(other.first_failure);
-    }
-
-    fn active_value(&mut self, value: f32) {
-        let value = ValueRange::of(value);
-        self.active_range = Some(self.active_range.map_or(value, |range| range.union(value)));
-    }
-
-    /// The first thing that failed, and how many more did.
-    pub fn failure(&self) -> Option<String> {
-        let more = self.failures.saturating_sub(1);
-        self.first_failure
-            .as_ref()
-            .map(|f| if more > 0 { format!("{f} (and {more} more)") } else { f.clone() })
-    }
-}
-
 /// Compares a frame of a pack with the tree that it was made from.
 pub(super) fn compare<T: Scalar>(
     tree: &Tree<T>,
@@ -120,15 +21,16 @@ pub(super) fn compare<T: Scalar>(
     reader: &FrameReader,
     promise: &Promise,
 ) -> FrameError {
-    let c = Comparison { tree, reading, reader, promise };
+    let comparison = Comparison { tree, reading, reader, promise };
     let mut error = FrameError::default();
-    c.check_header(info, &mut error);
-    c.check_tiles(&mut error);
-    c.check_outside(&mut error);
+    comparison.check_header(info, &mut error);
+    comparison.check_tiles(&mut error);
+    comparison.check_outside(&mut error);
     // Summed leaf by leaf in a fixed order, so that figures do not depend on threads.
-    let leaves: Vec<FrameError> = (0..tree.leaves.len()).into_par_iter().map(|leaf| c.leaf(leaf)).collect();
+    let leaves: Vec<FrameError> =
+        (0..tree.leaves.len()).into_par_iter().map(|leaf| comparison.leaf(leaf)).collect();
     leaves.into_iter().for_each(|leaf| error.add(leaf));
-    c.check_error_norm(&mut error);
+    comparison.check_error_l2(&mut error);
     error
 }
 
@@ -141,7 +43,7 @@ struct Comparison<'a, T> {
 
 /// How far the error that is measured may be from the one that the encoder left in the frame table: both
 /// are sums of the same squares, in another order.
-const NORM_TOLERANCE: f64 = 1e-12;
+const ERROR_L2_TOLERANCE: f64 = 1e-12;
 
 impl<T: Scalar> Comparison<'_, T> {
     fn check_header(&self, info: &GridInfo, error: &mut FrameError) {
@@ -184,7 +86,7 @@ impl<T: Scalar> Comparison<'_, T> {
     fn check_tile(&self, origin: Coord, dim: i32, value: T, active: bool, error: &mut FrameError) {
         let value = self.reading.value(value);
         if active {
-            error.active_value(value);
+            error.add_active_value(value);
         } else if value == self.reader.grid().background {
             return;
         }
@@ -228,11 +130,11 @@ impl<T: Scalar> Comparison<'_, T> {
 
     /// The encoder's error is known to the last bit, so texels that were changed later give themselves
     /// away, also in block formats, whose own promise is loose.
-    fn check_error_norm(&self, error: &mut FrameError) {
+    fn check_error_l2(&self, error: &mut FrameError) {
         let ours = error.codec_squares.iter().sum::<f64>().sqrt();
         let theirs = self.reader.frame().record.error_l2;
         // What the pack says may be infinite or no number, and is not near anything then.
-        let is_near = (ours - theirs).abs() <= NORM_TOLERANCE * ours;
+        let is_near = (ours - theirs).abs() <= ERROR_L2_TOLERANCE * ours;
         if !is_near {
             error.fail(|| format!("the texels' error is {ours:e}, the encoder left {theirs:e}"));
         }
@@ -303,7 +205,7 @@ impl<T: Scalar> Comparison<'_, T> {
         let origin = self.tree.leaves.origins[leaf];
         let source = self.tree.leaves.values(leaf);
         let mask = &self.tree.leaves.masks[leaf];
-        mask.ones().for_each(|i| error.active_value(self.reading.value(source[i])));
+        mask.ones().for_each(|i| error.add_active_value(self.reading.value(source[i])));
 
         let background = self.reader.grid().background;
         let (region, _) = self.reader.locate(origin);
@@ -335,14 +237,14 @@ impl<T: Scalar> Comparison<'_, T> {
             let float_difference = f64::from(ours) - f64::from(theirs);
             let flipped = self.promise.sign_matters.is_some() && (ours < 0.0) != (theirs < 0.0);
             let from_texel = contract.codec.filter(|_| mask.get(i) || !contract.exact_inactive);
-            error.all.voxel(difference, flipped);
+            error.all.add_voxel(difference, flipped);
             if let Some(codec) = from_texel {
                 error.codec_squares[codec as usize] += float_difference * float_difference;
             }
             if mask.get(i) {
-                error.active.voxel(difference, flipped);
+                error.active.add_voxel(difference, flipped);
                 error.active_float_squares += float_difference * float_difference;
-                error.histogram[bin(difference.abs() / self.promise.peak)] += 1;
+                error.histogram[error_bin(difference.abs() / self.promise.peak)] += 1;
             }
             let at = || origin.offset_by(Coord::child_offset(i, 3, 1)).0;
             let reach = float_difference.abs() + f64::from(spread.as_ref().map_or(0.0, |s| s[i]));

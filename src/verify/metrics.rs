@@ -4,7 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::PicturesReport;
-use super::compare::{ERROR_BINS, Error, FrameError, Histogram};
+use super::frame_error::{ERROR_BINS, ErrorSums, FrameError, Histogram};
 use super::promise::Promise;
 use crate::codec::Codec;
 use crate::pack::{Grid, Pack};
@@ -89,7 +89,7 @@ pub struct VerifyReport {
 }
 
 impl Metrics {
-    fn new(error: &Error, peak: f64) -> Self {
+    fn new(error: &ErrorSums, peak: f64) -> Self {
         let voxels = error.voxels.max(1) as f64;
         // The squares of the smallest errors are 0, but an error is one.
         let rmse = (error.squares / voxels).sqrt().max(error.max / voxels.sqrt());
@@ -221,7 +221,7 @@ impl VerifyReport {
         for (grid, (errors, is_integer)) in pack.grids().iter().zip(errors) {
             let promise = Promise::new(grid, settings, is_integer);
             let peak = promise.peak;
-            let (mut active, mut all) = (Error::default(), Error::default());
+            let (mut active, mut all) = (ErrorSums::default(), ErrorSums::default());
             let mut histogram = [0; ERROR_BINS];
             let first_frame = frames.len();
             for (frame, error) in grid.frames.iter().zip(&errors) {

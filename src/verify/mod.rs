@@ -6,6 +6,7 @@
 //! [`crate::stages`]: what a stage does wrong would be wrong on both sides, and seen on none.
 
 mod compare;
+mod frame_error;
 mod metrics;
 mod pictures;
 mod promise;
@@ -15,7 +16,7 @@ use std::path::{Path, PathBuf};
 
 use rayon::prelude::*;
 
-pub use compare::{ERROR_BINS, Histogram};
+pub use frame_error::{ERROR_BINS, Histogram};
 pub use metrics::{FrameReport, GridReport, Metrics, VerifyReport, WorstFrame};
 pub use pictures::{
     DIFFERENCE_GAIN, PictureReport, PictureSettings, PicturesReport, Seen, TracerDifference, difference_map,
@@ -29,7 +30,8 @@ use crate::pack::{Frame, Grid, Pack, Provenance};
 use crate::progress::Progress;
 use crate::settings::{NonFinite, Settings};
 use crate::vdb::{GridClass, Scalar, ValueType, VdbFile, with_scalar_type};
-use compare::{FrameError, compare};
+use compare::compare;
+use frame_error::FrameError;
 use promise::Promise;
 pub use promise::{KEPT_INTEGER_ERROR, SIGN_MATTERS_VOXELS};
 

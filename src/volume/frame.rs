@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{BRICK_DIM, Blocks, Brick, Constant, Coord, CoordBox, ValueRange};
+use super::{BRICK_DIM, Brick, ChunkedVec, Constant, Coord, CoordBox, ValueRange};
 
 /// What stands at one of an L2 node's 4096 places.
 #[derive(Clone, Copy, Debug, Serialize, Deserialize)]
@@ -76,7 +76,7 @@ pub struct FlatFrame {
     /// The cells that are not all background, ascending by origin.
     pub cells: Vec<Cell>,
     /// The bricks that the cells name, in the order in which they name them.
-    pub bricks: Blocks<Brick>,
+    pub bricks: ChunkedVec<Brick>,
     /// The source's counts.
     pub stats: FrameStats,
 }

@@ -6,7 +6,7 @@ use bytemuck::{Pod, Zeroable};
 use hashbrown::HashTable;
 use xxhash_rust::xxh3::{xxh3_64, xxh3_128};
 
-use super::{BRICK_VOXELS, Brick, List, Mask512, SCRATCH_SMALL, Scratch, ScratchFolder, ScratchResult};
+use super::{BRICK_VOXELS, Brick, ChunkedVec, Mask512, SCRATCH_SMALL, Scratch, ScratchFolder, ScratchResult};
 
 /// Bricks that are worked on before what was made of them is put away: enough batches of an encoder for every core.
 pub const BRICKS_IN_FLIGHT: u32 = 4096;
@@ -18,34 +18,34 @@ pub const BRICKS_IN_FLIGHT: u32 = 4096;
 pub struct BrickPool {
     by_digest: HashTable<u32>,
     /// The first bytes of each digest. The rest of it is looked at where these are the same.
-    starts: List<u64>,
-    bricks: List<Known>,
-    facts: Scratch,
+    digest_starts: ChunkedVec<u64>,
+    bricks: ChunkedVec<PlaceAndFlags>,
+    masks_and_digests: Scratch,
     values: Scratch,
 }
 
 /// A digest is its own hash.
-fn start(digest: &[u8; 32]) -> u64 {
+fn start_of(digest: &[u8; 32]) -> u64 {
     u64::from_ne_bytes(*digest.first_chunk().expect("a digest is 32 bytes"))
 }
 
 /// What is known of a brick in a word: its place among the bricks of the frame that had it first, of which no frame has
 /// 2^30, and two flags.
 #[derive(Clone, Copy)]
-struct Known(u32);
+struct PlaceAndFlags(u32);
 
-impl Known {
+impl PlaceAndFlags {
     const KEEPS_MASK: u32 = 1 << 31;
     /// Whether its values were put in.
-    const IS_THERE: u32 = 1 << 30;
+    const HAS_VALUES: u32 = 1 << 30;
 
     fn new(place: u32, keeps_mask: bool) -> Self {
-        assert!(place < Self::IS_THERE, "a frame's bricks are fewer than 2^30");
+        assert!(place < Self::HAS_VALUES, "a frame's bricks are fewer than 2^30");
         Self(place | if keeps_mask { Self::KEEPS_MASK } else { 0 })
     }
 
     fn place(self) -> u32 {
-        self.0 & !(Self::KEEPS_MASK | Self::IS_THERE)
+        self.0 & !(Self::KEEPS_MASK | Self::HAS_VALUES)
     }
 
     fn is(self, flag: u32) -> bool {
@@ -56,7 +56,7 @@ impl Known {
 /// What is asked of a brick together with its values.
 #[derive(Clone, Copy, Pod, Zeroable)]
 #[repr(C)]
-struct Facts {
+struct MaskAndDigest {
     active: Mask512,
     digest: [u8; 32],
 }
@@ -70,9 +70,9 @@ impl BrickPool {
     pub fn new(scratch: &ScratchFolder) -> Self {
         Self {
             by_digest: HashTable::new(),
-            starts: List::default(),
-            bricks: List::default(),
-            facts: Scratch::new(scratch, size_of::<Facts>(), SCRATCH_SMALL),
+            digest_starts: ChunkedVec::default(),
+            bricks: ChunkedVec::default(),
+            masks_and_digests: Scratch::new(scratch, size_of::<MaskAndDigest>(), SCRATCH_SMALL),
             values: Scratch::new(scratch, BRICK_VOXELS * 4, 0),
         }
     }
@@ -110,31 +110,32 @@ impl BrickPool {
         keeps_mask: bool,
         place: u32,
     ) -> ScratchResult<(u32, bool)> {
-        if let Some((id, mut facts)) = self.find(digest)? {
+        if let Some((id, mut known)) = self.find(digest)? {
             // Without a kept mask bricks are one if their values are. The pool's counts as active what is
             // active in any of them.
-            let union = facts.active.union(active);
-            if union != facts.active {
-                facts.active = union;
-                self.facts.put(id, bytemuck::bytes_of(&facts))?;
+            let union = known.active.union(active);
+            if union != known.active {
+                known.active = union;
+                self.masks_and_digests.put(id, bytemuck::bytes_of(&known))?;
             }
             return Ok((id, false));
         }
-        let (id, start) = (self.len(), start(digest));
-        let starts = &self.starts;
+        let (id, start) = (self.len(), start_of(digest));
+        let starts = &self.digest_starts;
         self.by_digest.insert_unique(start, id, |id| starts[*id]);
-        self.starts.push(start);
-        self.bricks.push(Known::new(place, keeps_mask));
-        self.facts.put(id, bytemuck::bytes_of(&Facts { active: *active, digest: *digest }))?;
+        self.digest_starts.push(start);
+        self.bricks.push(PlaceAndFlags::new(place, keeps_mask));
+        self.masks_and_digests
+            .put(id, bytemuck::bytes_of(&MaskAndDigest { active: *active, digest: *digest }))?;
         Ok((id, true))
     }
 
-    fn find(&self, digest: &[u8; 32]) -> ScratchResult<Option<(u32, Facts)>> {
-        let start = start(digest);
-        for &id in self.by_digest.iter_hash(start).filter(|id| self.starts[**id] == start) {
-            let facts: Facts = self.facts.get(id)?;
-            if facts.digest == *digest {
-                return Ok(Some((id, facts)));
+    fn find(&self, digest: &[u8; 32]) -> ScratchResult<Option<(u32, MaskAndDigest)>> {
+        let start = start_of(digest);
+        for &id in self.by_digest.iter_hash(start).filter(|id| self.digest_starts[**id] == start) {
+            let known: MaskAndDigest = self.masks_and_digests.get(id)?;
+            if known.digest == *digest {
+                return Ok(Some((id, known)));
             }
         }
         Ok(None)
@@ -146,8 +147,8 @@ impl BrickPool {
     /// When the scratch file cannot be written.
     pub fn seal(&mut self) -> ScratchResult<()> {
         self.by_digest = HashTable::new();
-        self.starts = List::default();
-        self.facts.flush()?;
+        self.digest_starts = ChunkedVec::default();
+        self.masks_and_digests.flush()?;
         self.values.flush()
     }
 
@@ -164,13 +165,13 @@ impl BrickPool {
     /// # Errors
     /// When the scratch file cannot be read back.
     pub fn digests(&self, ids: &[u32]) -> ScratchResult<Vec<[u8; 32]>> {
-        let facts = self.facts.read_as::<Facts>(ids)?;
-        Ok(facts.into_iter().map(|facts| facts.digest).collect())
+        let known = self.masks_and_digests.read_as::<MaskAndDigest>(ids)?;
+        Ok(known.into_iter().map(|known| known.digest).collect())
     }
 
     /// Whether a brick's mask is part of what it is.
     pub fn keeps_mask(&self, id: u32) -> bool {
-        self.bricks[id].is(Known::KEEPS_MASK)
+        self.bricks[id].is(PlaceAndFlags::KEEPS_MASK)
     }
 
     /// The place of a brick among those of the frame that had it first.
@@ -183,13 +184,13 @@ impl BrickPool {
     /// # Errors
     /// When the scratch file cannot be read back.
     pub fn active_hashes(&self, ids: &[u32]) -> ScratchResult<Vec<u64>> {
-        let facts = self.facts.read_as::<Facts>(ids)?;
-        Ok(facts.iter().map(|facts| hash(&facts.active)).collect())
+        let known = self.masks_and_digests.read_as::<MaskAndDigest>(ids)?;
+        Ok(known.iter().map(|known| hash(&known.active)).collect())
     }
 
     /// Whether a brick's values were put in.
-    pub fn is_there(&self, id: u32) -> bool {
-        self.bricks[id].is(Known::IS_THERE)
+    pub fn has_values(&self, id: u32) -> bool {
+        self.bricks[id].is(PlaceAndFlags::HAS_VALUES)
     }
 
     /// Puts a brick's values in.
@@ -197,7 +198,7 @@ impl BrickPool {
     /// # Errors
     /// When the scratch file cannot be written.
     pub fn put(&mut self, id: u32, values: &[f32; BRICK_VOXELS]) -> ScratchResult<()> {
-        self.bricks[id].0 |= Known::IS_THERE;
+        self.bricks[id].0 |= PlaceAndFlags::HAS_VALUES;
         self.values.put(id, bytemuck::bytes_of(values))
     }
 
@@ -207,14 +208,14 @@ impl BrickPool {
     /// When the scratch file cannot be read back.
     pub fn read(&self, ids: &[u32]) -> ScratchResult<Vec<Brick>> {
         let mut out = Vec::with_capacity(ids.len());
-        let facts = self.facts.read_as::<Facts>(ids)?;
-        let mut each = ids.iter().zip(facts);
+        let known = self.masks_and_digests.read_as::<MaskAndDigest>(ids)?;
+        let mut each = ids.iter().zip(known);
         self.values.read(ids, |values| {
-            let (&id, facts) = each.next().expect("each brick has facts and values");
-            let keeps_mask = self.bricks[id].is(Known::KEEPS_MASK);
+            let (&id, known) = each.next().expect("each brick has a mask and values");
+            let keeps_mask = self.bricks[id].is(PlaceAndFlags::KEEPS_MASK);
             out.push(Brick {
                 values: bytemuck::pod_read_unaligned(values),
-                active: facts.active,
+                active: known.active,
                 keeps_mask,
             });
         })?;

@@ -9,41 +9,33 @@ use std::time::Duration;
 
 use futures_util::{StreamExt, stream};
 use object_store::Error::{PermissionDenied, Unauthenticated};
-use object_store::aws::{AmazonS3Builder, AmazonS3ConfigKey};
-use object_store::azure::{AzureConfigKey, MicrosoftAzureBuilder};
-use object_store::gcp::{GoogleCloudStorageBuilder, GoogleConfigKey};
 use object_store::path::Path;
-use object_store::prefix::PrefixStore;
-use object_store::{
-    BackoffConfig, ClientConfigKey, ObjectStore, ObjectStoreExt, ObjectStoreScheme, RetryConfig,
-};
+use object_store::{ObjectStore, ObjectStoreExt};
 use tokio::runtime::{Builder, Handle, Runtime};
 use tokio::sync::{Semaphore, watch};
 use tokio::time::error::Elapsed;
 use tokio::time::{Instant, timeout, timeout_at};
 use url::Url;
 
+use super::connect::{ANSWER_TIMEOUT, cause_of, connect, is_missing};
 use super::{Map, Policy, Wanted};
 use crate::cache::lock;
 
 /// Failures in a row after which the remote is given up: one may be chance, three are a server that is gone.
 const GIVE_UP_AFTER: u32 = 3;
-/// How long a server may take for its answer, retries included. Buckets answer within tenths of a second; each
-/// failure in a row halves it, so that a dead one costs 4 + 2 + 1 seconds even if it is asked for one key at a time.
-const PATIENCE: Duration = Duration::from_secs(4);
-/// The slowest transfer worth waiting for, in bytes per second and object: with all [`LOOKUPS`] at once it is a
+/// The slowest transfer worth waiting for, in bytes per second and object: with all [`CONCURRENT_LOOKUPS`] at once it is a
 /// 16 Mbit/s line, below which a remote is of little use.
-const SLOWEST: u64 = 64 << 10;
+const SLOWEST_BYTES_PER_SECOND: u64 = 64 << 10;
 /// Reads in flight, over all threads: enough to hide a round trip of 100 ms behind 300 answers per second.
-const LOOKUPS: usize = 32;
+const CONCURRENT_LOOKUPS: usize = 32;
 /// Uploads in flight: nobody waits for them, so they leave most of the line to the reads.
-const UPLOADS: usize = 8;
+const CONCURRENT_UPLOADS: usize = 8;
 /// Bytes that may wait for their upload; the memory that a slow line may cost.
-const QUEUE: usize = 64 << 20;
+const QUEUE_BYTES: usize = 64 << 20;
 /// How often the end tells what is left.
-const STEP: Duration = Duration::from_millis(100);
+const REPORT_INTERVAL: Duration = Duration::from_millis(100);
 /// What an upload takes of the queue at least, for its own bookkeeping: so tiny entries are bounded, too.
-const LEAST: usize = 4 << 10;
+const LEAST_QUEUED_BYTES: usize = 4 << 10;
 
 /// A bucket that several machines share as a cache.
 ///
@@ -130,9 +122,9 @@ impl Remote {
             store,
             name: name.to_string(),
             health: watch::Sender::default(),
-            lookups: Semaphore::new(LOOKUPS),
-            uploads: Semaphore::new(UPLOADS),
-            queue: Arc::new(Semaphore::new(QUEUE)),
+            lookups: Semaphore::new(CONCURRENT_LOOKUPS),
+            uploads: Semaphore::new(CONCURRENT_UPLOADS),
+            queue: Arc::new(Semaphore::new(QUEUE_BYTES)),
             unsent: AtomicU64::new(0),
             distrusted: Mutex::default(),
         };
@@ -149,10 +141,10 @@ impl Remote {
     pub fn get_many(&self, map: Map, wanted: &[Wanted]) -> Vec<Option<Vec<u8>>> {
         let shared = &*self.shared;
         let lookup = |wanted: &Wanted| {
-            let (path, limit) = (path(map, &wanted.digest), wanted.limit);
+            let (path, limit) = (object_path(map, &wanted.digest), wanted.limit);
             async move { shared.attempt(&shared.lookups, shared.download(&path, limit)).await.flatten() }
         };
-        self.handle.block_on(stream::iter(wanted).map(lookup).buffered(LOOKUPS).collect())
+        self.handle.block_on(stream::iter(wanted).map(lookup).buffered(CONCURRENT_LOOKUPS).collect())
     }
 
     /// Says that a blob's bytes are not what its name says, so that it is written once more although it is there.
@@ -174,7 +166,7 @@ impl Remote {
         }
         self.shared.unsent.fetch_add(1, Ordering::Relaxed);
         // An entry longer than the queue takes all of it, rather than never being uploaded.
-        let size = bytes.len().clamp(LEAST, QUEUE) as u32;
+        let size = bytes.len().clamp(LEAST_QUEUED_BYTES, QUEUE_BYTES) as u32;
         let Ok(room) = self.shared.queue.clone().try_acquire_many_owned(size) else { return };
         let shared = self.shared.clone();
         self.handle.spawn(async move {
@@ -232,10 +224,10 @@ impl Remote {
         self.handle.block_on(async {
             let end = Instant::now() + at_most;
             // The queue is empty when all of it can be had. When the time is over, what waits stays unsent.
-            let empty = shared.queue.acquire_many(QUEUE as u32);
+            let empty = shared.queue.acquire_many(QUEUE_BYTES as u32);
             tokio::pin!(empty);
             while Instant::now() < end {
-                let step = end.min(Instant::now() + STEP);
+                let step = end.min(Instant::now() + REPORT_INTERVAL);
                 if timeout_at(step, &mut empty).await.is_ok() || !left(self.unsent()) {
                     break;
                 }
@@ -280,29 +272,30 @@ impl Shared {
     }
 
     /// How long the next answer may take.
-    fn patience(&self) -> Duration {
-        PATIENCE / (1 << self.health.borrow().in_a_row)
+    fn answer_timeout(&self) -> Duration {
+        ANSWER_TIMEOUT / (1 << self.health.borrow().in_a_row)
     }
 
     /// The bytes at `path`; `None` if there are none or more than `limit`.
     async fn download(&self, path: &Path, limit: u64) -> Result<Option<Vec<u8>>, String> {
-        let patience = self.patience();
+        let answer_timeout = self.answer_timeout();
         let started = Instant::now();
-        let object = match timeout(patience, self.store.get(path)).await.map_err(silence)? {
+        let object = match timeout(answer_timeout, self.store.get(path)).await.map_err(no_answer)? {
             Ok(object) if object.meta.size <= limit => object,
             Ok(_) => return Ok(None),
             Err(error) if is_missing(&error) => return Ok(None),
-            Err(error) => return Err(told(error)),
+            Err(error) => return Err(cause_of(error)),
         };
         let mut bytes = Vec::new();
         let mut chunks = object.into_stream();
         loop {
-            // Bytes buy time at the slowest rate, but never more than the patience at once: so neither a server
+            // Bytes buy time at the slowest rate, but never more than that timeout at once: so neither a server
             // that stalls nor one that drips is waited for.
-            let deadline = (started + patience + transfer(bytes.len())).min(Instant::now() + patience);
-            match timeout_at(deadline, chunks.next()).await.map_err(silence)? {
+            let deadline =
+                (started + answer_timeout + transfer_time(bytes.len())).min(Instant::now() + answer_timeout);
+            match timeout_at(deadline, chunks.next()).await.map_err(no_answer)? {
                 None => return Ok(Some(bytes)),
-                Some(chunk) => bytes.extend_from_slice(&chunk.map_err(told)?),
+                Some(chunk) => bytes.extend_from_slice(&chunk.map_err(cause_of)?),
             }
             // Whatever the server said of its length.
             if bytes.len() as u64 > limit {
@@ -312,9 +305,9 @@ impl Shared {
     }
 
     async fn upload(&self, map: Map, digest: [u8; 32], bytes: Vec<u8>) -> Result<(), String> {
-        let path = path(map, &digest);
+        let path = object_path(map, &digest);
         let is_replaced = map == Map::Actions || lock(&self.distrusted).contains(&digest);
-        let deadline = self.patience() + transfer(bytes.len());
+        let deadline = self.answer_timeout() + transfer_time(bytes.len());
         let work = async {
             // A blob's name is its content, so one of the right length is the same. This asks first, since a
             // conditional write would send the bytes before it is refused, and not every server knows it.
@@ -327,91 +320,28 @@ impl Shared {
             }
             self.store.put(&path, bytes.into()).await.map(drop)
         };
-        match timeout(deadline, work).await.map_err(silence)? {
+        match timeout(deadline, work).await.map_err(no_answer)? {
             // Credentials that may only read are no failure of the server: lookups go on.
             Err(error @ (PermissionDenied { .. } | Unauthenticated { .. })) => {
-                self.health.send_modify(|health| health.refusal = Some(told(error)));
+                self.health.send_modify(|health| health.refusal = Some(cause_of(error)));
                 Ok(())
             }
-            result => result.map_err(told),
+            result => result.map_err(cause_of),
         }
     }
 }
 
 /// How long `bytes` take at the slowest rate.
-fn transfer(bytes: usize) -> Duration {
-    Duration::from_millis(bytes as u64 * 1000 / SLOWEST)
+fn transfer_time(bytes: usize) -> Duration {
+    Duration::from_millis(bytes as u64 * 1000 / SLOWEST_BYTES_PER_SECOND)
 }
 
 /// Where an entry is below the prefix: as on disk.
-fn path(map: Map, digest: &[u8; 32]) -> Path {
+fn object_path(map: Map, digest: &[u8; 32]) -> Path {
     let hex = blake3::Hash::from(*digest).to_hex();
     Path::from(format!("{}/{}/{}", map.folder(), &hex[..2], &hex[2..]))
 }
 
-/// The store behind `url`.
-fn connect(url: &Url, options: &[(&str, &str)]) -> Result<Box<dyn ObjectStore>, String> {
-    // The HTTP client has TLS but no cryptography of its own. That another provider is installed is as good.
-    let _ = rustls::crypto::ring::default_provider().install_default();
-    // Two retries bridge a hiccup; the first after 100 ms, about a round trip to a far bucket. Longer pauses would
-    // only use up the patience.
-    let backoff = BackoffConfig { init_backoff: Duration::from_millis(100), ..Default::default() };
-    let retry = RetryConfig { backoff, max_retries: 2, retry_timeout: PATIENCE };
-    // Two seconds leave half of the patience for the answer. Its own limit for whole requests would cut large blobs
-    // short; the deadlines here are stricter where it matters.
-    let client = [(ClientConfigKey::ConnectTimeout, "2s"), (ClientConfigKey::Timeout, "1h")];
-    // The builders are alike, but share no trait.
-    macro_rules! build {
-        ($builder:ty, $key:ty, $prefix:ident) => {{
-            let mut builder = <$builder>::from_env().with_url(url.as_str()).with_retry(retry);
-            for (key, value) in client {
-                builder = builder.with_config(<$key>::Client(key), value);
-            }
-            for (key, value) in options {
-                let key: $key = key.parse().map_err(told)?;
-                builder = builder.with_config(key, *value);
-            }
-            let store = builder.build().map_err(told)?;
-            Ok(Box::new(PrefixStore::new(store, $prefix)))
-        }};
-    }
-    use ObjectStoreScheme::{AmazonS3, GoogleCloudStorage, MicrosoftAzure};
-    match ObjectStoreScheme::parse(url) {
-        Ok((AmazonS3, prefix)) => build!(AmazonS3Builder, AmazonS3ConfigKey, prefix),
-        Ok((GoogleCloudStorage, prefix)) => build!(GoogleCloudStorageBuilder, GoogleConfigKey, prefix),
-        Ok((MicrosoftAzure, prefix)) => build!(MicrosoftAzureBuilder, AzureConfigKey, prefix),
-        _ => {
-            Err("the URL must be like s3://bucket/prefix, gs://bucket/prefix or az://container/prefix".into())
-        }
-    }
-}
-
-/// Whether the object is not there, rather than its bucket, which would be a mistake in the URL.
-fn is_missing(error: &object_store::Error) -> bool {
-    let text = error.to_string();
-    matches!(error, object_store::Error::NotFound { .. })
-        && !["NoSuchBucket", "ContainerNotFound"].iter().any(|code| text.contains(code))
-}
-
-fn silence(_: Elapsed) -> String {
+fn no_answer(_: Elapsed) -> String {
     "no answer, or too slow a one".into()
-}
-
-/// What caused an error, on one line and without URLs and the body of the answer, which may quote credentials.
-fn told(error: object_store::Error) -> String {
-    let mut cause: &dyn std::error::Error = &error;
-    while let Some(deeper) = cause.source() {
-        cause = deeper;
-    }
-    let text = cause.to_string();
-    // Of an answer only the status and S3's code for what is wrong; anything else with markup is not for people.
-    let code = text.split_once("<Code>").and_then(|(_, rest)| rest.split_once("</Code>"));
-    let head = match text.strip_prefix("Server returned non-2xx status code: ") {
-        Some(answer) => answer.split(':').next(),
-        None => text.split(['<', '{']).next(),
-    };
-    let parts = head.into_iter().chain(code.map(|(code, _)| code));
-    let words: Vec<_> = parts.flat_map(str::split_whitespace).filter(|word| !word.contains("://")).collect();
-    // Nobody reads more of a warning.
-    words.join(" ").chars().take(200).collect()
 }

@@ -2,6 +2,8 @@
 
 #[cfg(feature = "remote")]
 mod bucket;
+#[cfg(feature = "remote")]
+mod connect;
 #[cfg(not(feature = "remote"))]
 mod none;
 

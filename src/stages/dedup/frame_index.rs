@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::pods;
 use crate::stages::flatten::Flattened;
 use crate::volume::{
-    Blocks, Brick, BrickPool, CELL_DIM, Cell, CellContent, Child, Constant, Coord, FlatFrame, FrameStats,
+    Brick, BrickPool, CELL_DIM, Cell, CellContent, Child, ChunkedVec, Constant, Coord, FlatFrame, FrameStats,
     InactiveRule, Mask512, ROOT_DIM, ValueRange,
 };
 
@@ -76,12 +76,10 @@ pub enum Values {
 
 impl FrameIndex {
     /// Takes the voxels away from a frame: gives them apart, each brick with whether it keeps its mask.
-    pub fn split(flat: Flattened, policy: MaskPolicy) -> (Self, Blocks<Brick>) {
+    pub fn split(flat: Flattened, policy: MaskPolicy) -> (Self, ChunkedVec<Brick>) {
         let Flattened { frame: FlatFrame { roots, cells, bricks: mut voxels, stats }, background } = flat;
-        let blocks = voxels.blocks_mut().par_iter_mut();
-        let outlined =
-            blocks.flat_map_iter(|b| b.iter_mut().map(|b| IndexedBrick::new(b, background, policy)));
-        let (mut bricks, signs): (Vec<IndexedBrick>, Vec<Option<Mask512>>) = outlined.unzip();
+        let indexed = voxels.par_iter_mut().map(|brick| IndexedBrick::new(brick, background, policy));
+        let (mut bricks, signs): (Vec<IndexedBrick>, Vec<Option<Mask512>>) = indexed.unzip();
         let mut sign_mask = Vec::new();
         for (brick, signs) in bricks.iter_mut().zip(signs) {
             brick.sign_mask = sign_mask.len() as u32;
@@ -167,18 +165,18 @@ impl IndexedBrick {
         };
         brick.keeps_mask = !(drop && rule == InactiveRule::Background);
         let rule = if brick.keeps_mask { rule } else { InactiveRule::Texel };
-        let mut frame_index = Self { active: brick.active, ..Self::zeroed() };
-        frame_index.flags = rule as u32 | if brick.keeps_mask { KEEPS_MASK } else { 0 };
+        let mut indexed = Self { active: brick.active, ..Self::zeroed() };
+        indexed.flags = rule as u32 | if brick.keeps_mask { KEEPS_MASK } else { 0 };
         match values(brick, &texel_mask(&brick.active, rule), background) {
             Values::Constant(value) => {
-                frame_index.flags |= IS_CONSTANT;
-                (frame_index.min, frame_index.max) = (value, value);
+                indexed.flags |= IS_CONSTANT;
+                (indexed.min, indexed.max) = (value, value);
             }
             Values::Varied(range, digest) => {
-                (frame_index.min, frame_index.max, frame_index.digest) = (range.min, range.max, digest);
+                (indexed.min, indexed.max, indexed.digest) = (range.min, range.max, digest);
             }
         }
-        (frame_index, (rule == InactiveRule::Sign).then_some(sign_mask))
+        (indexed, (rule == InactiveRule::Sign).then_some(sign_mask))
     }
 }
 

@@ -6,6 +6,7 @@
 
 mod frame_index;
 mod nodes;
+mod record;
 
 use std::collections::{BTreeSet, HashMap};
 use std::ops::Range;
@@ -14,12 +15,13 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 use crate::volume::{
-    Blocks, Brick, BrickPool, CellContent, Child, Constant, Coord, FrameStats, InactiveRule, Interner, List,
+    Brick, BrickPool, CellContent, Child, ChunkedVec, Constant, Coord, FrameStats, InactiveRule, Interner,
     Mask512, ScratchError, ScratchFolder, ScratchResult, SortedMap, ValueRange, bits,
 };
 
 pub use frame_index::{FrameIndex, IndexedBrick, MaskPolicy, Values, texel_mask};
 pub use nodes::{Node, Nodes};
+pub use record::{Payload, Record};
 
 /// One grid of a sequence, with everything that repeats stored once.
 pub struct SequenceTree {
@@ -32,13 +34,13 @@ pub struct SequenceTree {
     /// Runs of entries that [`SequenceTree::record`] understands, one run a distinct list of children.
     pub runs: Interner<u32>,
     /// The distinct L3 records of which more is to be said than which brick they are.
-    records: List<Record>,
+    records: ChunkedVec<Record>,
     /// The distinct masks. A mask of signs follows the mask it belongs to.
     pub masks: Interner<Mask512>,
     /// The distinct bricks.
     pub pool: BrickPool,
     /// For each brick of the pool, the range of the values that its texels carry.
-    pub brick_ranges: List<ValueRange>,
+    pub brick_ranges: ChunkedVec<ValueRange>,
     /// For each frame, the bricks of the pool that it had first.
     pub own_bricks: Vec<Range<u32>>,
     /// Where what does not fit in memory is.
@@ -50,13 +52,13 @@ pub struct SequenceTree {
     record_of_constant: HashMap<(u32, Option<u32>, InactiveRule), u32>,
 }
 
-/// Reads the bricks of a frame.
-pub type Read = dyn Fn(usize) -> Result<Blocks<Brick>> + Send + Sync;
+/// Reads the bricks of the frame at a place.
+pub type ReadFrame = dyn Fn(usize) -> Result<ChunkedVec<Brick>> + Send + Sync;
 
 /// The way to a frame's voxels.
 pub struct Fetch {
-    /// Reads those of the frame at a place.
-    pub read: Box<Read>,
+    /// Reads them.
+    pub read: Box<ReadFrame>,
     /// Frames that may be read at a time.
     pub at_once: usize,
 }
@@ -78,49 +80,6 @@ pub enum CellRef {
     Constant(Constant),
     /// The L2 node at this place of [`SequenceTree::nodes`].
     Node(u32),
-}
-
-/// One distinct 8³ region.
-#[derive(Clone, Copy, Debug)]
-pub struct Record {
-    mask: u32,
-    /// A value's bits, or a brick.
-    word: u32,
-    is_brick: bool,
-    /// What its inactive voxels are.
-    pub rule: InactiveRule,
-}
-
-impl Record {
-    const NO_MASK: u32 = u32::MAX;
-
-    fn new(mask: Option<u32>, rule: InactiveRule, payload: Payload) -> Self {
-        let (is_brick, word) = match payload {
-            Payload::Constant(value) => (false, value.to_bits()),
-            Payload::Brick(id) => (true, id),
-        };
-        Self { mask: mask.unwrap_or(Self::NO_MASK), word, is_brick, rule }
-    }
-
-    /// The place of its mask in [`SequenceTree::masks`]; `None` where a voxel is active if its value is
-    /// not the background.
-    pub fn mask(&self) -> Option<u32> {
-        (self.mask != Self::NO_MASK).then_some(self.mask)
-    }
-
-    /// What its other voxels are.
-    pub fn payload(&self) -> Payload {
-        if self.is_brick { Payload::Brick(self.word) } else { Payload::Constant(f32::from_bits(self.word)) }
-    }
-}
-
-/// The values of a [`Record`].
-#[derive(Clone, Copy, Debug)]
-pub enum Payload {
-    /// All the same.
-    Constant(f32),
-    /// Those of this brick of the pool.
-    Brick(u32),
 }
 
 /// The frame cannot be added.
@@ -160,10 +119,10 @@ impl SequenceTree {
             frames: Vec::new(),
             nodes: Nodes::new(&scratch),
             runs: Interner::default(),
-            records: List::default(),
+            records: ChunkedVec::default(),
             masks: Interner::default(),
             pool: BrickPool::new(&scratch),
-            brick_ranges: List::default(),
+            brick_ranges: ChunkedVec::default(),
             own_bricks: Vec::new(),
             scratch,
             fetch,
@@ -189,7 +148,11 @@ impl SequenceTree {
     ///
     /// # Errors
     /// [`DedupError`].
-    pub fn add(&mut self, frame_index: FrameIndex, voxels: Option<Blocks<Brick>>) -> Result<(), DedupError> {
+    pub fn add(
+        &mut self,
+        frame_index: FrameIndex,
+        voxels: Option<ChunkedVec<Brick>>,
+    ) -> Result<(), DedupError> {
         self.check_background(&frame_index)?;
         let first = self.pool.len();
         let mut cells = Vec::with_capacity(frame_index.cells.len());
@@ -225,9 +188,9 @@ impl SequenceTree {
     }
 
     /// Puts the voxels of a frame's own bricks into the pool.
-    fn put_voxels(&mut self, frame: usize, voxels: &Blocks<Brick>) -> ScratchResult<()> {
+    fn put_voxels(&mut self, frame: usize, voxels: &ChunkedVec<Brick>) -> ScratchResult<()> {
         for id in self.own_bricks[frame].clone() {
-            if !self.pool.is_there(id) {
+            if !self.pool.has_values(id) {
                 self.pool.put(id, &voxels[self.pool.place(id)].values)?;
             }
         }
@@ -235,7 +198,7 @@ impl SequenceTree {
     }
 
     /// The same for voxels that were fetched for a frame index from elsewhere: they must be those that it tells of.
-    fn put_fetched(&mut self, frame: usize, voxels: &Blocks<Brick>) -> Result<()> {
+    fn put_fetched(&mut self, frame: usize, voxels: &ChunkedVec<Brick>) -> Result<()> {
         let own: Vec<u32> = self.own_bricks[frame].clone().collect();
         let digests = self.pool.digests(&own)?;
         let pool = &self.pool;
@@ -257,7 +220,8 @@ impl SequenceTree {
     /// When a frame cannot be read or the scratch file not be written.
     pub fn fetch(&mut self, ids: &[u32]) -> Result<()> {
         let frame = |id: &u32| self.own_bricks.partition_point(|own| own.end <= *id);
-        let absent: BTreeSet<usize> = ids.iter().filter(|&&id| !self.pool.is_there(id)).map(frame).collect();
+        let absent: BTreeSet<usize> =
+            ids.iter().filter(|&&id| !self.pool.has_values(id)).map(frame).collect();
         let absent: Vec<usize> = absent.into_iter().collect();
         let at_once = self.fetch.as_ref().map_or(1, |fetch| fetch.at_once);
         for frames in absent.chunks(at_once) {
@@ -302,21 +266,21 @@ impl SequenceTree {
     }
 
     /// The record of a brick of the frame that is being added, whose signs are among `sign_mask`.
-    fn brick(&mut self, place: u32, frame_index: &IndexedBrick, sign_mask: &[Mask512]) -> ScratchResult<u32> {
-        let (rule, keeps_mask) = (frame_index.rule(), frame_index.keeps_mask());
-        let (range, digest) = match frame_index.values() {
+    fn brick(&mut self, place: u32, brick: &IndexedBrick, sign_mask: &[Mask512]) -> ScratchResult<u32> {
+        let (rule, keeps_mask) = (brick.rule(), brick.keeps_mask());
+        let (range, digest) = match brick.values() {
             Values::Constant(value) => {
-                let mask = self.mask(frame_index, sign_mask);
+                let mask = self.mask(brick, sign_mask);
                 return Ok(self.constant_record(value, mask, rule));
             }
             Values::Varied(range, digest) => (range, digest),
         };
-        let (id, is_new) = self.pool.insert(&digest, &frame_index.active, keeps_mask, place)?;
+        let (id, is_new) = self.pool.insert(&digest, &brick.active, keeps_mask, place)?;
         if !is_new {
             return Ok(self.record_of_brick.get(id).unwrap_or(id | PLAIN_BRICK));
         }
         self.brick_ranges.push(range);
-        let mask = self.mask(frame_index, sign_mask);
+        let mask = self.mask(brick, sign_mask);
         if (mask, rule) == (None, InactiveRule::Texel) {
             return Ok(id | PLAIN_BRICK);
         }
@@ -326,10 +290,10 @@ impl SequenceTree {
         Ok(record)
     }
 
-    fn mask(&mut self, frame_index: &IndexedBrick, sign_mask: &[Mask512]) -> Option<u32> {
-        frame_index.keeps_mask().then(|| match frame_index.signs() {
-            Some(place) => self.masks.intern(&[frame_index.active, sign_mask[place]]),
-            None => self.masks.intern(&[frame_index.active]),
+    fn mask(&mut self, brick: &IndexedBrick, sign_mask: &[Mask512]) -> Option<u32> {
+        brick.keeps_mask().then(|| match brick.signs() {
+            Some(place) => self.masks.intern(&[brick.active, sign_mask[place]]),
+            None => self.masks.intern(&[brick.active]),
         })
     }
 

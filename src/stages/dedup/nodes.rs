@@ -87,7 +87,7 @@ impl Nodes {
         mut visit: impl FnMut(Node, &Children) -> Result<(), E>,
     ) -> Result<(), E> {
         let ids: Vec<u32> = (0..self.nodes.len() as u32).collect();
-        for ids in ids.chunks(AT_ONCE) {
+        for ids in ids.chunks(NODES_PER_READ) {
             for (&id, children) in ids.iter().zip(&self.children.read_as::<Children>(ids)?) {
                 visit(self.nodes[id as usize], children)?;
             }
@@ -96,5 +96,5 @@ impl Nodes {
     }
 }
 
-/// Nodes whose children are in memory together: 64 KB.
-const AT_ONCE: usize = 128;
+/// Nodes whose children are read from the scratch file together: 64 KiB.
+const NODES_PER_READ: usize = 128;

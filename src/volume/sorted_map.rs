@@ -1,6 +1,6 @@
-//! What few bricks of a sequence have.
+//! A map for what few bricks of a sequence have.
 
-/// Entries by brick: eight bytes or so for each that there is, and nothing for the others.
+/// A map from bricks to entries, sorted by brick: about eight bytes an entry, and nothing for bricks without one.
 #[derive(Debug)]
 pub struct SortedMap<T>(Vec<(u32, T)>);
 
