@@ -41,10 +41,20 @@
 //! println!("{}: {region:?}", pack.grids()[0].name);
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
+//!
+//! # Features
+//!
+//! All are on by default. The code above needs none of them.
+//!
+//! - `cli`: the command line, and the binary. It turns on `report`.
+//! - `gpu`: the wgpu tracer. Without it the CPU renders all pictures, as on a machine without a Vulkan device.
+//! - `remote`: caches in a bucket of S3, Google Cloud Storage or Azure.
+//! - `report`: reports as HTML, Markdown and JUnit XML, charts, and [`sweep`].
 
 pub mod atomic_file;
 pub mod cache;
 pub mod cancel;
+#[cfg(feature = "cli")]
 pub mod cli;
 pub mod codec;
 pub mod component;
@@ -62,6 +72,7 @@ pub mod report;
 pub mod sequence;
 pub mod settings;
 pub mod stages;
+#[cfg(feature = "report")]
 pub mod sweep;
 pub mod units;
 pub mod vdb;

@@ -10,42 +10,19 @@ use wgpu::util::DeviceExt;
 
 use self::params::Params;
 use self::pipelines::{Has, Pipelines, WORKGROUP};
-use super::cpu::{Scene, TraceError};
+use super::cpu::Scene;
 use super::image::Image;
 use crate::codec::{Codec, TextureFormat};
-use crate::pack::{Atlas, Pack, PackError};
+use crate::pack::{Atlas, Pack};
 use crate::volume::CoordBox;
+
+pub use super::gpu_error::GpuError;
 
 /// `volpack.wgsl` and `hdda.wgsl`, what an engine takes over.
 pub const VOLPACK_WGSL: &str =
     concat!(include_str!("shaders/volpack.wgsl"), "\n", include_str!("shaders/hdda.wgsl"));
 /// `tracer.wgsl`, which goes with it.
 pub const TRACER_WGSL: &str = include_str!("shaders/tracer.wgsl");
-
-/// Why a GPU cannot trace a pack.
-#[derive(Debug, thiserror::Error)]
-pub enum GpuError {
-    /// No Vulkan, Metal or Direct3D 12 answers, or none that can trace.
-    #[error("{0}")]
-    Unavailable(String),
-    /// The adapter lacks something.
-    #[error("{adapter} {what}")]
-    Lacks {
-        /// Its name.
-        adapter: String,
-        /// What it lacks.
-        what: String,
-    },
-    /// The device failed.
-    #[error("the GPU failed: {0}")]
-    Failed(String),
-    /// The pack is damaged.
-    #[error(transparent)]
-    Pack(#[from] PackError),
-    /// No tracer can trace the frame.
-    #[error(transparent)]
-    Trace(#[from] TraceError),
-}
 
 /// A device that can trace.
 pub struct Gpu {

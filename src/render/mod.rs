@@ -12,7 +12,12 @@
 mod camera;
 mod cpu;
 mod decoded_frame;
+#[cfg(feature = "gpu")]
 pub mod gpu;
+#[cfg(not(feature = "gpu"))]
+#[path = "no_gpu.rs"]
+pub mod gpu;
+mod gpu_error;
 mod image;
 mod renderer;
 mod scene;

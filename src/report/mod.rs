@@ -1,15 +1,17 @@
 //! What files hold and what packs cost, as people and machines read it.
+//!
+//! The feature `report` adds the pages (HTML, Markdown, JUnit XML) and the charts; the figures need no feature.
 
 mod baseline;
 mod budget;
+#[cfg(feature = "report")]
 pub mod chart;
 mod frames;
 mod gallery;
-mod html;
-mod junit;
-mod markdown;
 pub mod model;
 mod pack;
+#[cfg(feature = "report")]
+mod pages;
 mod vdb;
 
 use std::path::Path;
@@ -17,11 +19,10 @@ use std::path::Path;
 pub use baseline::Baseline;
 pub use budget::{Checked, of_total};
 pub use gallery::{Gallery, KeyFrame, Png, Strip, gallery};
-pub use html::html;
-pub use junit::junit;
-pub use markdown::markdown;
 pub use model::Breach;
 pub use pack::{CodecSummary, PackSummary};
+#[cfg(feature = "report")]
+pub use pages::{PageError, html, junit, markdown};
 pub use vdb::{GridSummary, TopologySummary, ValueSummary, VdbSummary};
 
 use crate::pack::{Pack, Provenance};
@@ -105,11 +106,6 @@ impl Reported<'_> {
 }
 
 impl Report {
-    /// The limits that an asset is past; `None` for those of all assets together.
-    fn breaches_of(&self, asset: Option<&str>) -> impl Iterator<Item = &Breach> {
-        self.breaches.iter().filter(move |breach| breach.asset.as_deref() == asset)
-    }
-
     /// Puts assets together, and checks what all of them may cost.
     pub fn new(
         assets: Vec<AssetReport>,

@@ -4,11 +4,11 @@ use askama::Template;
 use base64::Engine;
 use base64::prelude::BASE64_STANDARD;
 
-use super::chart::{ChartError, Line, frames_svg, histogram_svg};
-use super::gallery::{Gallery, Png};
 use super::markdown::arrow;
-use super::model::{AssetReport, Breach, Figures, PackReport, Report};
 use crate::codec::TexelCodec;
+use crate::report::chart::{ChartError, Line, frames_svg, histogram_svg};
+use crate::report::model::{AssetReport, Breach, Figures, FrameCost, PackReport, Report, StageSeconds};
+use crate::report::{CodecSummary, Gallery, KeyFrame, Png, Strip};
 use crate::units::{bytes, count, of_limit, percent, seconds};
 
 /// Why a page could not be made.
@@ -119,7 +119,7 @@ pub fn html(report: &Report, galleries: &[Option<Gallery>]) -> Result<String, Pa
         report,
         verdict: verdict(report),
         css: css(),
-        js: include_str!("templates/report.js"),
+        js: include_str!("../templates/report.js"),
         total: vec![
             total("On the GPU", "gpu_bytes", sums.gpu_bytes, sums.gpu_budget),
             total("Files", "file_bytes", sums.file_bytes, sums.file_budget),
@@ -134,7 +134,7 @@ pub fn html(report: &Report, galleries: &[Option<Gallery>]) -> Result<String, Pa
 
 /// The style sheet, with a colour for each codec.
 fn css() -> String {
-    let mut css = include_str!("templates/report.css").to_owned();
+    let mut css = include_str!("../templates/report.css").to_owned();
     for codec in TexelCodec::ALL {
         css += &format!(".part.{} {{ background: {}; }}\n", codec.name(), codec.color());
     }
@@ -191,7 +191,7 @@ fn details<'a>(
     pack: &'a PackReport,
     gallery: Option<&Gallery>,
 ) -> Result<Details<'a>, PageError> {
-    let codec = |(name, codec): (&&'static str, &super::CodecSummary)| {
+    let codec = |(name, codec): (&&'static str, &CodecSummary)| {
         let path = |key: &str| format!("{path}/summary/codecs/{name}/{key}");
         // The error of what has no record.
         let label = if codec.bricks == 0 { "empty" } else { *name };
@@ -202,7 +202,7 @@ fn details<'a>(
             fact(name, path("share_of_error"), codec.share_of_error, percent(codec.share_of_error)),
         ]
     };
-    let frame = |(i, frame): (usize, &super::model::FrameCost)| {
+    let frame = |(i, frame): (usize, &FrameCost)| {
         let path = |key: &str| format!("{path}/frames/{i}/{key}");
         [
             fact("frame", path("frame"), frame.frame, frame.frame.to_string()),
@@ -218,7 +218,7 @@ fn details<'a>(
     };
     let stages = pack.build.iter().flat_map(|build| build.stages.iter().enumerate());
     let longest = stages.clone().map(|(_, stage)| stage.seconds).fold(1e-9, f64::max);
-    let stage = |(i, stage): (usize, &super::model::StageSeconds)| {
+    let stage = |(i, stage): (usize, &StageSeconds)| {
         let path = format!("{path}/build/stages/{i}/seconds");
         (fact(stage.stage, path, stage.seconds, seconds(stage.seconds)), stage.seconds / longest * 100.0)
     };
@@ -303,7 +303,7 @@ fn parts(path: &str, pack: &PackReport) -> Vec<Part> {
 fn charts(pack: &PackReport) -> Result<Vec<String>, ChartError> {
     let mut charts = Vec::new();
     let grids = &pack.summary.grids;
-    let of = |grid: &String, value: &dyn Fn(&super::model::FrameCost) -> Option<f64>| {
+    let of = |grid: &String, value: &dyn Fn(&FrameCost) -> Option<f64>| {
         let frames = pack.frames.iter().filter(|frame| frame.grid == *grid);
         frames.filter_map(|frame| Some((frame.frame, value(frame)?))).collect::<Vec<_>>()
     };
@@ -328,7 +328,7 @@ fn charts(pack: &PackReport) -> Result<Vec<String>, ChartError> {
     Ok(charts)
 }
 
-fn shot(key: &super::KeyFrame) -> Shot {
+fn shot(key: &KeyFrame) -> Shot {
     let worst = if key.is_worst { ", the worst" } else { "" };
     Shot {
         title: format!("{}, frame {}{worst}", key.grid, key.frame),
@@ -338,7 +338,7 @@ fn shot(key: &super::KeyFrame) -> Shot {
     }
 }
 
-fn player(strip: &super::Strip) -> Player {
+fn player(strip: &Strip) -> Player {
     Player {
         grid: strip.grid.clone(),
         first: strip.frames.first().copied().unwrap_or_default(),

@@ -2,7 +2,7 @@
 
 use quick_junit::{NonSuccessKind, Report as Suites, TestCase, TestCaseStatus, TestSuite};
 
-use super::model::Report;
+use crate::report::model::{Breach, Report};
 
 /// The report as JUnit XML: a suite an asset, with a case for its build and one for each limit that is past.
 ///
@@ -41,7 +41,7 @@ pub fn junit(report: &Report) -> Result<String, quick_junit::SerializeError> {
 
 /// A failed case for each limit that an asset, or all of them, are past.
 fn over(report: &Report, asset: Option<&str>) -> Vec<TestCase> {
-    let case = |breach: &super::model::Breach| {
+    let case = |breach: &Breach| {
         let mut status = TestCaseStatus::non_success(NonSuccessKind::Failure);
         status.set_message(format!("{}; {}", breach.message, breach.remedy));
         TestCase::new(format!("budget {}", breach.budget), status)

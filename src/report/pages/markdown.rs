@@ -2,7 +2,7 @@
 
 use askama::Template;
 
-use super::model::{PackReport, Report};
+use crate::report::model::{PackReport, Report};
 use crate::units::{bytes, of_limit, percent};
 
 #[derive(Template)]
