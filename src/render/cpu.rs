@@ -13,7 +13,7 @@ pub(super) use super::scene::{AMBIENT, Scene, Setup, TraceError};
 use super::surface::{cubic, evaluate, first_change};
 use super::traverse::{Box3, Ray, Real, Walk};
 use super::{Mode, Traversal};
-use crate::volume::{Coord, ROOT_DIM};
+use crate::volume::{BRICK_DIM, CELL_DIM, Coord, ROOT_DIM};
 
 /// Steps after which a ray is given up: more than any box in view has cells across.
 const MAX_STEPS: u32 = 1 << 16;
@@ -385,7 +385,7 @@ impl<'a, F: Real> Tracer<'a, F> {
 
 /// Side, half width of the line in cells, and colour of what is drawn around nodes.
 const NODE_COLORS: [(i32, f64, [f32; 3]); 3] =
-    [(ROOT_DIM, 1.0, [0.1, 0.2, 1.0]), (128, 0.75, [1.0, 0.15, 0.1]), (8, 0.5, [0.0, 0.9, 0.9])];
+    [(ROOT_DIM, 1.0, [0.1, 0.2, 1.0]), (CELL_DIM, 0.75, [1.0, 0.15, 0.1]), (BRICK_DIM, 0.5, [0.0, 0.9, 0.9])];
 
 /// The combinations of the four bits of a perturbation.
 const PERTURBATIONS: u32 = 16;

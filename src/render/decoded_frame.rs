@@ -7,7 +7,9 @@ use rayon::prelude::*;
 use crate::codec::Codec;
 use crate::pack::{FrameReader, PackError, Region};
 use crate::vdb::{Internal, Scalar, Tree};
-use crate::volume::{BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, CoordBox, Mask512, ROOT_DIM};
+use crate::volume::{
+    BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, CoordBox, Mask512, NODE_CHILDREN, ROOT_DIM,
+};
 
 /// A frame as nested constants and bricks of values.
 pub struct DecodedFrame {
@@ -30,8 +32,8 @@ pub struct DecodedBrick {
 
 enum Cell {
     Constant(Constant),
-    /// For each of 4096 places what is there; 0 is background.
-    Node(Box<[u32; 4096]>, Vec<Constant>),
+    /// For each place of an L2 node what is there; 0 is background.
+    Node(Box<[u32; NODE_CHILDREN]>, Vec<Constant>),
 }
 
 /// How far apart GPUs interpolate, of the distance of a block's endpoints.
@@ -208,7 +210,7 @@ impl DecodedFrame {
         let cell = self
             .cells
             .entry(origin.align_down(CELL_DIM))
-            .or_insert_with(|| Cell::Node(Box::new([0; 4096]), Vec::new()));
+            .or_insert_with(|| Cell::Node(Box::new([0; NODE_CHILDREN]), Vec::new()));
         let Cell::Node(places, constants) = cell else { unreachable!("a cell is constant or a node") };
         (&mut places[origin.child_index(4, BRICK_DIM)], constants)
     }

@@ -62,7 +62,10 @@ fn root_origin(c: &mut Cursor, seen: &mut HashSet<Coord>) -> Result<Coord> {
         *v = c.i32("a root entry's origin")?;
     }
     if !origin.is_aligned(ROOT_DIM) {
-        return Err(VdbError::corrupt(at, format!("root entry at {:?}, not a multiple of 4096", origin.0)));
+        return Err(VdbError::corrupt(
+            at,
+            format!("root entry at {:?}, not a multiple of {ROOT_DIM}", origin.0),
+        ));
     }
     if !seen.insert(origin) {
         return Err(VdbError::corrupt(at, format!("two root entries at {:?}", origin.0)));

@@ -8,8 +8,8 @@ use crate::codec::{BrickRange, Codec, SequenceRange};
 use crate::error::{corrupt, ensure};
 use crate::layout::{FrameRecord, GridRecord};
 use crate::tree::{
-    self, GRID_WORDS, HEADER_WORDS, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS, grid, header,
-    l1_words,
+    self, GRID_WORDS, HEADER_WORDS, L3Record, Link, MASK_WORDS, NODE_FIRST_RECORD, NODE_MASK_WORDS,
+    NODE_WORDS, RECORD_WORDS, grid, header, l1_words,
 };
 use crate::{Atlas, CELL_DIM, Coord, Grid, InactiveRule, PackError};
 
@@ -81,7 +81,8 @@ pub(crate) fn tree(words: &[u32], atlases: &[Atlas]) -> Result<(), PackError> {
             .map_err(|what| PackError::Corrupt(format!("L3 record {i}: {what}")))?;
     }
     for (i, node) in words[nodes].chunks_exact(NODE_WORDS).enumerate() {
-        let (mask, ranks, first) = (&node[..128], &node[128..192], node[192] as usize);
+        let (mask, ranks) = node[..NODE_FIRST_RECORD].split_at(NODE_MASK_WORDS);
+        let first = node[NODE_FIRST_RECORD] as usize;
         ensure(tree::ranks(mask) == ranks, || format!("L2 node {i} has wrong ranks"))?;
         ensure(first + ones(mask) <= count(header::RECORDS), || {
             format!("L2 node {i} has children outside the L3 records")

@@ -6,7 +6,10 @@ use std::collections::HashMap;
 use crate::codec::{BrickRange, Codec, decode, spread};
 use crate::error::ensure;
 use crate::tables::fits_memory;
-use crate::tree::{self, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS, header, l1_words};
+use crate::tree::{
+    self, L3Record, Link, MASK_WORDS, NODE_FIRST_RECORD, NODE_MASK_WORDS, NODE_WORDS, RECORD_WORDS, header,
+    l1_words,
+};
 use crate::{
     Atlas, BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, CoordBox, Frame, Grid, InactiveRule, Mask512,
     Pack, PackError, ROOT_DIM, check,
@@ -83,7 +86,7 @@ impl Pack {
         let ones = |mask: &[u32]| mask.iter().map(|w| u64::from(w.count_ones())).sum::<u64>();
         let nodes = words[words[header::NODE_AT] as usize..].chunks_exact(NODE_WORDS);
         let in_node: Vec<u64> =
-            nodes.take(words[header::NODES] as usize).map(|node| ones(&node[..128])).collect();
+            nodes.take(words[header::NODES] as usize).map(|node| ones(&node[..NODE_MASK_WORDS])).collect();
         let mut total = 0u64;
         let mut in_l1: HashMap<(u32, usize), u64> = HashMap::new();
         for grid in self.grids() {
@@ -175,9 +178,9 @@ impl FrameReader<'_> {
     fn child(&self, node: u32, index: usize) -> Region {
         let words = self.words();
         let node = &words[words[header::NODE_AT] as usize + node as usize * NODE_WORDS..][..NODE_WORDS];
-        match tree::rank(&node[..128], &node[128..192], index) {
+        match tree::rank(&node[..NODE_MASK_WORDS], &node[NODE_MASK_WORDS..NODE_FIRST_RECORD], index) {
             None => Region::Background,
-            Some(rank) => self.record(node[192] + rank),
+            Some(rank) => self.record(node[NODE_FIRST_RECORD] + rank),
         }
     }
 
@@ -236,7 +239,7 @@ impl FrameReader<'_> {
     fn for_each_child(&self, node: u32, origin: Coord, visit: &mut impl FnMut(Coord, i32, Region)) {
         let words = self.words();
         let node = &words[words[header::NODE_AT] as usize + node as usize * NODE_WORDS..][..NODE_WORDS];
-        for (record, place) in (node[192]..).zip(set_bits(&node[..128])) {
+        for (record, place) in (node[NODE_FIRST_RECORD]..).zip(set_bits(&node[..NODE_MASK_WORDS])) {
             visit(origin.offset_by(Coord::child_offset(place, 4, BRICK_DIM)), BRICK_DIM, self.record(record));
         }
     }

@@ -3,14 +3,18 @@
 //! This file has the words' places and meaning; `docs/format.md`, "The tree", is the specification.
 
 use crate::codec::Codec;
-use crate::{Constant, InactiveRule};
+use crate::{Constant, InactiveRule, NODE_CHILDREN};
 
 /// Words of the tree's header.
 pub const HEADER_WORDS: usize = 32;
 /// Words of a grid's header.
 pub const GRID_WORDS: usize = 16;
-/// Words of an L2 node: 4096 mask bits, 128 16-bit ranks, the first record.
-pub const NODE_WORDS: usize = 128 + 64 + 1;
+/// Words of an L2 node's mask, a bit a child.
+pub const NODE_MASK_WORDS: usize = NODE_CHILDREN / 32;
+/// The word of an L2 node that has its first record; between it and the mask lie 16-bit ranks, one a word of the mask.
+pub const NODE_FIRST_RECORD: usize = NODE_MASK_WORDS + NODE_MASK_WORDS / 2;
+/// Words of an L2 node.
+pub const NODE_WORDS: usize = NODE_FIRST_RECORD + 1;
 /// Words of an L3 record.
 pub const RECORD_WORDS: usize = 3;
 /// Words of a mask.

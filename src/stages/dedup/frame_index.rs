@@ -8,7 +8,7 @@ use crate::pods;
 use crate::stages::flatten::Flattened;
 use crate::volume::{
     Brick, BrickPool, CELL_DIM, Cell, CellContent, Child, ChunkedVec, Constant, Coord, FlatFrame, FrameStats,
-    InactiveRule, Mask512, ROOT_DIM, ValueRange,
+    InactiveRule, Mask512, NODE_CHILDREN, ROOT_DIM, ValueRange,
 };
 
 /// Whether bricks keep their active masks.
@@ -104,7 +104,9 @@ impl FrameIndex {
                     next += 1;
                     place == next - 1
                 });
-                in_order && numbered && children.last().is_none_or(|(place, _)| *place < 4096)
+                in_order
+                    && numbered
+                    && children.last().is_none_or(|(place, _)| usize::from(*place) < NODE_CHILDREN)
             }
         }) && next as usize == self.bricks.len()
             && self.bricks.iter().all(|brick| brick.is_sound(self.sign_mask.len()))

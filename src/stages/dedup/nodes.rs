@@ -5,10 +5,12 @@ use std::collections::HashMap;
 use bytemuck::{Pod, Zeroable};
 use xxhash_rust::xxh3::xxh3_128;
 
-use crate::volume::{Interner, SCRATCH_SMALL, Scratch, ScratchError, ScratchFolder, ScratchResult};
+use crate::volume::{
+    Interner, NODE_CHILDREN, SCRATCH_SMALL, Scratch, ScratchError, ScratchFolder, ScratchResult,
+};
 
-/// Which of a node's 4096 children exist: one bit a child, x slowest.
-pub type Children = [u64; 64];
+/// Which of an L2 node's children exist: one bit a child, x slowest.
+pub type Children = [u64; NODE_CHILDREN / 64];
 
 /// An L2 node.
 #[derive(Clone, Copy, PartialEq, Pod, Zeroable)]

@@ -7,7 +7,7 @@ use crate::codec::{Codec, SequenceRange};
 use crate::error::Result;
 use crate::pack::Atlas;
 use crate::pack::tree::{
-    self, GRID_WORDS, HEADER_WORDS, L3Record, Link, MASK_WORDS, NODE_WORDS, RECORD_WORDS,
+    self, GRID_WORDS, HEADER_WORDS, L3Record, Link, MASK_WORDS, NODE_MASK_WORDS, NODE_WORDS, RECORD_WORDS,
 };
 use crate::stages::allocate::Coding;
 use crate::stages::dedup::{CellRef, FrameTree, Payload, SequenceTree};
@@ -184,7 +184,7 @@ impl TreeWords {
         sink(&self.head)?;
         for (grid, first_record) in with_first(grids, run_len) {
             grid.tree.nodes.visit(|node, children| {
-                let words: [u32; 128] = bytemuck::cast(*children);
+                let words: [u32; NODE_MASK_WORDS] = bytemuck::cast(*children);
                 sink(&words)?;
                 sink(&tree::ranks(&words))?;
                 sink(&[first_record + node.run])
