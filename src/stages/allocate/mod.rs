@@ -1,17 +1,11 @@
 //! Stage 5: how each brick is coded, and what its texels' 0 and 1 stand for.
 //!
-//! A uniform format gives every brick one codec. The adaptive one gives each the one that serves the whole best
-//! (`search`, `size`), as rate-distortion theory has it: the least D + λR, with one λ for all (Shoham & Gersho 1988).
+//! A uniform format gives every brick one codec ([`uniform`]), and may merge similar ones ([`clustered`]). The adaptive one
+//! gives each brick the codec that serves the whole best ([`adaptive`]).
 
 mod adaptive;
-mod borrow;
-mod candidate;
-mod choices;
-mod cluster;
+mod clustered;
 pub mod kmeans;
-mod search;
-mod size;
-mod target;
 
 use half::f16;
 
@@ -21,10 +15,8 @@ use crate::codec::{BrickRange, Codec, Fidelity, SequenceRange, TexelCodec};
 use crate::settings::RangeMode;
 use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder, ScratchResult, SortedMap, ValueRange};
 
-pub use adaptive::adaptive;
-pub use borrow::{EarlierOffers, Offer, OfferInputs, Offers};
-pub use cluster::clustered;
-pub use target::{AdaptiveGrid, Target};
+pub use adaptive::{AdaptiveGrid, EarlierOffers, Offer, OfferInputs, Offers, Target, adaptive};
+pub use clustered::clustered;
 
 /// How one grid's bricks are coded.
 pub struct Allocation {

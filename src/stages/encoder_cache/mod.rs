@@ -1,136 +1,32 @@
-//! Stages 5 and 7: what each codec makes of each brick, measured on decoded values. TrialResults once: what was tried to
+//! Stages 5 and 7: what each codec makes of each brick, measured on decoded values. Made once: what was tried to
 //! choose a codec is what goes into the pack.
 
+mod batch;
 mod measure;
 mod memo;
 mod spilled;
+mod trial;
 
 use std::collections::BTreeSet;
-use std::ops::Range;
 use std::time::{Duration, Instant};
 
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
 
 use super::dedup::{SequenceTree, texel_mask};
 use crate::cancel::CancelToken;
 use crate::codec::{BATCH, BrickRange, SequenceRange, TexelCodec, Texels, decode, encode, spread};
 use crate::error::Result;
-use crate::pods;
 use crate::profile;
 use crate::settings::RangeMode;
 use crate::volume::{
     BRICK_VOXELS, BRICKS_IN_FLIGHT, Brick, InactiveRule, Mask512, ScratchResult, ValueRange,
 };
+pub use batch::{BATCH_BRICKS, Batch};
+use batch::{batches, batches_of};
 pub use measure::Measure;
 pub use memo::Memo;
-pub use spilled::Note;
-
-/// What one codec does to one brick.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Cost {
-    /// Root of the squared error over the voxels that texels give; infinite where the codec is out of the
-    /// question.
-    pub error_l2: f64,
-    /// The same over active voxels.
-    pub active_error_l2: f64,
-    /// The largest error that an engine can read, on any GPU.
-    pub max: f32,
-}
-
-impl Cost {
-    /// No error at all.
-    pub const NONE: Self = Self { error_l2: 0.0, active_error_l2: 0.0, max: 0.0 };
-    /// More error than any.
-    pub const IMPOSSIBLE: Self =
-        Self { error_l2: f64::INFINITY, active_error_l2: f64::INFINITY, max: f32::INFINITY };
-}
-
-/// What a constant brick's value keeps small.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-pub enum ConstantAim {
-    /// The squared error: it is the mean.
-    Squares,
-    /// The largest error: it is the middle of the range.
-    Max,
-}
-
-/// A brick without texels, or with raw ones: what can be said of it without keeping a byte.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Plain {
-    /// What it would be as a constant.
-    pub value: f32,
-    /// As that constant.
-    pub constant: Cost,
-    /// As background, without a record.
-    pub empty: Cost,
-    /// In each codec of [`TexelCodec::ERROR_ONLY`].
-    pub error_only: [Cost; TexelCodec::ERROR_ONLY.len()],
-}
-
-/// What a brick is tried as.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-pub enum Trial {
-    /// Without texels, or with texels that are not kept: [`Plain`].
-    Plain,
-    /// With texels of a codec that [keeps them](TexelCodec::keeps_texels).
-    Texels(TexelCodec),
-}
-
-impl Trial {
-    /// All of them.
-    pub const ALL: [Self; 1 + TexelCodec::ALL.len()] = {
-        let mut all = [Self::Plain; 1 + TexelCodec::ALL.len()];
-        let mut i = 0;
-        while i < TexelCodec::ALL.len() {
-            all[1 + i] = Self::Texels(TexelCodec::ALL[i]);
-            i += 1;
-        }
-        all
-    };
-
-    /// Its place among them.
-    pub fn index(self) -> usize {
-        match self {
-            Self::Plain => 0,
-            Self::Texels(codec) => 1 + codec.index(),
-        }
-    }
-
-    /// Notes that are kept of a brick.
-    pub fn notes(self) -> usize {
-        match self {
-            Self::Plain => Plain::NOTES,
-            Self::Texels(_) => 1,
-        }
-    }
-
-    /// Bytes of texels of a brick.
-    pub fn texels(self) -> usize {
-        match self {
-            Self::Plain => 0,
-            Self::Texels(codec) => codec.codec().layout().brick_bytes(),
-        }
-    }
-}
-
-impl Plain {
-    const NOTES: usize = 2 + TexelCodec::ERROR_ONLY.len();
-
-    fn to_notes(self) -> impl Iterator<Item = Note> {
-        let own = [Note::new(self.constant, self.value.to_bits()), Note::new(self.empty, 0)];
-        own.into_iter().chain(self.error_only.map(|cost| Note::new(cost, 0)))
-    }
-
-    fn from_notes([constant, empty, error_only @ ..]: [Note; Self::NOTES]) -> Self {
-        Self {
-            value: f32::from_bits(constant.word),
-            constant: constant.cost(),
-            empty: empty.cost(),
-            error_only: error_only.map(|note| note.cost()),
-        }
-    }
-}
+pub use trial::{ConstantAim, Cost, Note, Plain, Trial, TrialResults};
 
 /// What the error of a grid's bricks depends on beside the bricks.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -148,21 +44,8 @@ pub struct Terms {
 /// Bricks that one thread encodes together at least: four fill the lanes of the BC7 encoder.
 const LEAST_BATCH: usize = 8;
 
-/// Bricks of a [`Batch`] at most: with 512 bytes of texels each, a megabyte.
-pub const BATCH_BRICKS: u32 = 2048;
-
 /// How long a build may go on before what it made is kept, so that one that is killed loses no more than that.
 const SAVE_EVERY: Duration = Duration::from_secs(2);
-
-/// Bricks of one frame that are kept and compared together.
-pub struct Batch {
-    /// The frame's place in the sequence.
-    pub frame: usize,
-    /// The batch's place in its frame.
-    pub part: u32,
-    /// The bricks of the pool that the frame had first and that are in this part of it.
-    pub ids: Range<u32>,
-}
 
 /// Results of earlier builds. Whoever runs the stages puts it around an [`EncoderCache`]; without one everything is
 /// made.
@@ -423,35 +306,6 @@ pub fn own_range(sequence: &SequenceRange, mode: RangeMode, values: ValueRange) 
         RangeMode::Sequence => BrickRange::SEQUENCE,
         RangeMode::Brick => sequence.fit(values.min, values.max),
     }
-}
-
-/// The places of the batches that some bricks, ascending, are in.
-fn batches_of(batches: &[Batch], ids: &[u32]) -> BTreeSet<usize> {
-    ids.iter().map(|id| batches.partition_point(|batch| batch.ids.end <= *id)).collect()
-}
-
-/// The batches of a grid, in the order of its pool.
-fn batches(tree: &SequenceTree) -> Vec<Batch> {
-    let mut all = Vec::new();
-    for (frame, own) in tree.own_bricks.iter().enumerate() {
-        let own: Vec<u32> = own.clone().collect();
-        let part = |id: &u32| tree.pool.place(*id) / BATCH_BRICKS;
-        for ids in own.chunk_by(|a, b| part(a) == part(b)) {
-            all.push(Batch { frame, part: part(&ids[0]), ids: ids[0]..ids[ids.len() - 1] + 1 });
-        }
-    }
-    all
-}
-
-/// What was made of some bricks in a trial, one brick after another.
-#[derive(Default, Serialize, Deserialize)]
-pub struct TrialResults {
-    /// [`Trial::notes`] a brick.
-    #[serde(with = "pods")]
-    pub notes: Vec<Note>,
-    /// [`Trial::texels`] a brick.
-    #[serde(with = "pods")]
-    pub texels: Vec<u8>,
 }
 
 /// What a codec made of some bricks.

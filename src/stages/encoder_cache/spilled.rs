@@ -1,41 +1,18 @@
 //! What was made of bricks: where it lies in memory, the rest in scratch files.
 
-use bytemuck::{Pod, Zeroable};
+use bytemuck::Zeroable;
 
-use super::{Cost, Trial, TrialResults};
+use super::trial::{Note, Trial, TrialResults};
 use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder, ScratchResult};
 
-/// A [`Cost`], and something more of what it is the cost of.
-#[derive(Clone, Copy, Pod, Zeroable)]
-#[repr(C)]
-pub struct Note {
-    error_l2: f64,
-    active_error_l2: f64,
-    max: f32,
-    /// What depends on the trial: a constant's value, a packing axis.
-    pub word: u32,
-}
-
-impl Note {
-    /// The note of a cost.
-    pub fn new(cost: Cost, word: u32) -> Self {
-        Self { error_l2: cost.error_l2, active_error_l2: cost.active_error_l2, max: cost.max, word }
-    }
-
-    /// The cost.
-    pub fn cost(&self) -> Cost {
-        Cost { error_l2: self.error_l2, active_error_l2: self.active_error_l2, max: self.max }
-    }
-}
-
-/// One trial of result for the bricks of a pool, each once: notes and texels.
+/// What one trial made of the bricks of a pool, each once: notes and texels.
 pub(super) struct Spilled {
     places: Places,
     notes: Scratch,
     texels: Option<Scratch>,
 }
 
-/// Where the results of each brick lie, as far as there are any. None are kept of a trial that nobody asks for.
+/// Where the results of each brick lie, as far as there are any. A trial that nobody asks for keeps none.
 enum Places {
     /// At the brick's number; whether they do.
     ByBrick(Vec<bool>),

@@ -2,7 +2,9 @@
 
 use super::candidate::{Candidate, PerCandidate};
 use super::choices::RECORD_BITS;
-use super::search::{GridSearch, Switch, first_step, switches};
+use super::search::GridSearch;
+use super::steps::first_step;
+use super::switches::{Switch, switches};
 use super::target::Target;
 use crate::codec::TexelCodec;
 use crate::error::Result;
@@ -114,7 +116,7 @@ fn at_size_above(
         let picks = if bytes(searches, &fine, fixed) <= limit { fine.clone() } else { all(searches, fits)? };
         let mut order: Vec<Switch> = Vec::new();
         for (g, (search, (coarse, fine))) in (0..).zip(searches.iter().zip(picks.iter().zip(&fine))) {
-            order.extend(switches(g, search, coarse, fine)?);
+            order.extend(switches(g, &search.table, coarse, fine)?);
         }
         order.sort_by(|a, b| b.gain.total_cmp(&a.gain));
         let moved = |count: usize| {

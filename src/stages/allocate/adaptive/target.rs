@@ -1,6 +1,6 @@
 //! What the adaptive format is asked for.
 
-use super::EarlierOffers;
+use super::offers::EarlierOffers;
 use crate::settings::Quality;
 use crate::stages::dedup::SequenceTree;
 use crate::stages::encoder_cache::EncoderCache;

@@ -1,13 +1,28 @@
-//! Every brick in the codec that serves the whole best.
+//! Every brick in the codec that serves the whole best, as rate-distortion theory has it: the least D + λR, with one λ for
+//! all (Shoham & Gersho 1988).
+
+mod candidate;
+mod choices;
+mod codebook;
+mod frame_floor;
+mod lending;
+mod offers;
+mod search;
+mod size;
+mod steps;
+mod switches;
+mod target;
+mod texel_references;
 
 use super::Allocation;
-use super::choices::tried_at_once;
-use super::search::GridSearch;
-use super::size::at_size;
-use super::target::{AdaptiveGrid, Target};
 use crate::cancel::CancelToken;
 use crate::error::Result;
 use crate::settings::{FRAME_MARGIN_DB, Quality};
+use choices::tried_at_once;
+pub use offers::{EarlierOffers, Offer, OfferInputs, Offers};
+use search::GridSearch;
+use size::at_size;
+pub use target::{AdaptiveGrid, Target};
 
 /// Gives each brick of each grid its codec. `advance` hears of bricks that slow codecs were tried on.
 ///

@@ -12,19 +12,17 @@ use std::collections::BTreeMap;
 use std::collections::btree_map::Entry;
 use std::ops::Range;
 
-use bytemuck::{Pod, Zeroable};
-use ndarray::Array2;
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 
+use super::codebook::{Codebook, Lender, decoded};
+use super::offers::{EarlierOffers, Offer, OfferInputs, Offers, TexelReference};
 use crate::cancel::CancelToken;
-use crate::codec::{BrickRange, Half, SequenceRange, TexelCodec, decode};
+use crate::codec::{BrickRange, Half, TexelCodec};
 use crate::error::Result;
-use crate::pods;
 use crate::profile;
 use crate::stages::dedup::SequenceTree;
-use crate::stages::encoder_cache::{Batch, Cost, EncoderCache, KeptBricks};
-use crate::volume::{BRICK_VOXELS, Brick, Mask512, ScratchResult};
+use crate::stages::encoder_cache::{Batch, EncoderCache};
+use crate::volume::ScratchResult;
 
 /// Bricks to either side that a batch is compared with at least: in short frames those of a few.
 const LEAST_NEAR: usize = 128;
@@ -33,78 +31,6 @@ const ROWS: usize = 32;
 /// Borrowers of batches that are compared side by side, so that all cores have work to the end. The referenced bricks of a batch
 /// more to either side are in memory, 2.4 KB each.
 const BORROWERS_SIDE_BY_SIDE: usize = 640;
-/// Lenders that are compared voxel by voxel.
-const CLOSEST: usize = 3;
-/// Values of a shape as it is first compared: means of 2³ voxels.
-const COARSE: usize = BRICK_VOXELS / 8;
-
-/// What a brick would be with another's texels.
-#[derive(Clone, Copy)]
-pub(super) struct TexelReference {
-    /// The brick whose texels they are.
-    pub referenced: u32,
-    /// The range that suits them best.
-    pub range: BrickRange,
-    /// What it does to the borrower: [`Cost::error_l2`],
-    pub error_l2: f64,
-    /// and [`Cost::active_error_l2`].
-    pub active_error_l2: f64,
-}
-
-/// What a brick would be with the texels of another: that one by its place among those that were compared, and its range as a record has it.
-#[derive(Clone, Copy, Pod, Zeroable)]
-#[repr(C)]
-pub struct Offer {
-    referenced: u32,
-    range: u32,
-    error_l2: f64,
-    active_error_l2: f64,
-}
-
-/// What was offered to the borrowers of a batch.
-#[derive(Default, Serialize, Deserialize)]
-pub struct Offers {
-    /// How many to each.
-    #[serde(with = "pods")]
-    counts: Vec<u8>,
-    /// One borrower's after another's, of each the closest first.
-    #[serde(with = "pods")]
-    all: Vec<Offer>,
-}
-
-/// Offers that earlier builds made. Whoever runs the stages puts it around a search; without one all are made.
-pub trait EarlierOffers: Sync {
-    /// For each of some comparisons what was offered, if it is known.
-    fn known(&self, comparisons: &[OfferInputs]) -> Vec<Option<Offers>>;
-    /// Keeps what was offered for later builds.
-    fn keep(&self, comparison: &OfferInputs, offers: &Offers);
-}
-
-/// What the offers of a comparison depend on.
-pub struct OfferInputs {
-    /// The batches that the referenced bricks are in.
-    pub around: Range<usize>,
-    /// The place among them of the one that the borrowers are in.
-    pub batch: usize,
-    /// The place of each borrower in its frame, and a hash of its active voxels.
-    pub borrowers: Vec<(u32, u64)>,
-    /// How many referenced bricks each of the batches has: places are told from each other by it.
-    pub counts: Vec<usize>,
-    /// The place of each referenced brick in its frame, and its codec.
-    pub referenced_bricks: Vec<(u32, TexelCodec)>,
-}
-
-/// A brick that could lend, with its texels as a GPU reads them, 0 to 1.
-struct Lender {
-    texels: Box<[f32; BRICK_VOXELS]>,
-    mean: f64,
-    /// Sum of squared differences from the mean.
-    energy: f64,
-    /// Sum of squares.
-    squares: f64,
-    /// Its shape as it is first compared.
-    coarse: [f32; COARSE],
-}
 
 /// Batches whose offers are looked for in the cache together: some requests to a remote one at a time, and the offers
 /// of no more bricks in memory than those of a few frames.
@@ -285,70 +211,6 @@ impl Near {
     }
 }
 
-fn decoded(
-    encoders: &EncoderCache,
-    tree: &SequenceTree,
-    referenced_bricks: &[(u32, TexelCodec)],
-) -> Result<Vec<Lender>> {
-    let mut places: [Vec<u32>; TexelCodec::ALL.len()] = Default::default();
-    let mut tried = Vec::new();
-    for &(id, codec) in referenced_bricks {
-        places[codec.index()].push(id);
-    }
-    for codec in TexelCodec::ALL {
-        tried.push(encoders.texels(&places[codec.index()], codec)?);
-    }
-    let referenced = |&(id, codec): &(u32, TexelCodec)| {
-        let place = places[codec.index()].binary_search(&id).expect("every lender is of one of the codecs");
-        let (KeptBricks { costs, bytes, axes }, codec) = (&tried[codec.index()], codec.codec());
-        let size = codec.layout().brick_bytes();
-        let (bytes, axis) = (&bytes[place * size..][..size], axes[place]);
-        let texels = decode(codec, bytes, axis, &SequenceRange::default(), BrickRange::SEQUENCE);
-        let (mean, energy) = moments(&texels);
-        let extent = encoders.range(tree, id).extent.to_f64() * f64::from(encoders.sequence.span);
-        let error_l2 = costs[place].error_l2;
-        // The part of its energy that is its own error is stretched with it.
-        let trust = (1.0 - (error_l2 / extent).powi(2) / energy.max(f64::MIN_POSITIVE)).max(0.0).sqrt();
-        let mut shape = [0.0; COARSE];
-        coarse(&texels, mean, energy, &mut shape);
-        let squares = sum(|i| f64::from(texels[i]).powi(2));
-        Lender { texels, mean, energy, squares, coarse: shape.map(|v| v * trust as f32) }
-    };
-    Ok(referenced_bricks.par_iter().map(referenced).collect())
-}
-
-/// Sums that run side by side: the order of adding is fixed, and a compiler may use vectors.
-const LANES: usize = 8;
-
-/// The sum of something over the voxels of a brick.
-fn sum(of: impl Fn(usize) -> f64) -> f64 {
-    let mut sums = [0.0; LANES];
-    for at in (0..BRICK_VOXELS).step_by(LANES) {
-        for (lane, sum) in sums.iter_mut().enumerate() {
-            *sum += of(at + lane);
-        }
-    }
-    sums.iter().sum()
-}
-
-/// Mean, and sum of squared differences from it.
-fn moments(values: &[f32; BRICK_VOXELS]) -> (f64, f64) {
-    let mean = sum(|i| f64::from(values[i])) / BRICK_VOXELS as f64;
-    (mean, sum(|i| (f64::from(values[i]) - mean).powi(2)))
-}
-
-/// A shape's coarse values less their mean, over the root of the energy of all 512.
-fn coarse(values: &[f32; BRICK_VOXELS], mean: f64, energy: f64, out: &mut [f32]) {
-    out.fill(0.0);
-    for (i, &value) in values.iter().enumerate() {
-        let (x, y, z) = (i >> 6, i >> 3 & 7, i & 7);
-        out[(x >> 1) << 4 | (y >> 1) << 2 | z >> 1] += value;
-    }
-    // The mean of eight voxels stands for eight: each side of a product gets the root of that.
-    let scale = 1.0 / (8.0 * energy.max(f64::MIN_POSITIVE)).sqrt();
-    out.iter_mut().for_each(|v| *v = ((f64::from(*v) - 8.0 * mean) * scale) as f32);
-}
-
 /// For each comparison, and each of its borrowers, the closest of the referenced bricks.
 fn nearest(
     encoders: &EncoderCache,
@@ -377,85 +239,4 @@ fn nearest(
         offers
     };
     Ok(comparisons.iter().map(of).collect())
-}
-
-/// The referenced bricks of a comparison, and their shapes as they are first compared, a row each.
-struct Codebook<'a> {
-    referenced_bricks: Vec<&'a Lender>,
-    shapes: Array2<f32>,
-}
-
-impl<'a> Codebook<'a> {
-    fn new(referenced_bricks: Vec<&'a Lender>) -> Self {
-        let mut shapes = Array2::<f32>::zeros((referenced_bricks.len(), COARSE));
-        for (referenced, mut row) in referenced_bricks.iter().zip(shapes.rows_mut()) {
-            row.as_slice_mut().expect("rows are contiguous").copy_from_slice(&referenced.coarse);
-        }
-        Self { referenced_bricks, shapes }
-    }
-
-    /// For each of some bricks the closest referenced bricks; `places` are those of the referenced bricks.
-    fn nearest(
-        &self,
-        encoders: &EncoderCache,
-        ids: &[u32],
-        bricks: &[Brick],
-        places: &[(u32, TexelCodec)],
-    ) -> Result<Offers> {
-        let mut means = Vec::with_capacity(bricks.len());
-        let mut shapes = Array2::<f32>::zeros((bricks.len(), COARSE));
-        for (brick, mut row) in bricks.iter().zip(shapes.rows_mut()) {
-            let (mean, energy) = moments(&brick.values);
-            coarse(&brick.values, mean, energy, row.as_slice_mut().expect("rows are contiguous"));
-            means.push(mean);
-        }
-        // The line through a shape leaves 1 - s² of a brick's energy: the most similar leaves the least.
-        let similar = shapes.dot(&self.shapes.t());
-        let mut all = Offers::default();
-        for (((&id, brick), mean), similar) in ids.iter().zip(bricks).zip(means).zip(similar.rows()) {
-            let measure = encoders.measure(brick, &Mask512::ALL);
-            let offer = |j: usize| {
-                let range = borrow(&encoders.sequence, brick, mean, self.referenced_bricks.get(j)?)?;
-                let value = encoders.sequence.decoder(range);
-                let decoded = self.referenced_bricks[j].texels.map(value);
-                let Cost { error_l2, active_error_l2, .. } = measure.of(&decoded, None);
-                Some(Offer { referenced: j as u32, range: range.to_word(), error_l2, active_error_l2 })
-            };
-            let closest = closest(similar.iter().copied(), |j| places[j].0 != id);
-            let mut offers: Vec<Offer> = closest.into_iter().filter_map(offer).collect();
-            offers.sort_by(|a, b| a.error_l2.total_cmp(&b.error_l2));
-            all.counts.push(offers.len() as u8);
-            all.all.extend(offers);
-        }
-        Ok(all)
-    }
-}
-
-/// The places of the greatest similarities above 0; places that are none stand for fewer.
-fn closest(similar: impl Iterator<Item = f32>, may_lend: impl Fn(usize) -> bool) -> [usize; CLOSEST] {
-    let mut closest = [(0.0f32, usize::MAX); CLOSEST];
-    for (j, similar) in similar.enumerate() {
-        if similar > closest[CLOSEST - 1].0 && may_lend(j) {
-            let at = closest.partition_point(|(s, _)| *s >= similar);
-            closest[at..].rotate_right(1);
-            closest[at] = (similar, j);
-        }
-    }
-    closest.map(|(_, j)| j)
-}
-
-/// The range under which a referenced brick's texels come closest to a brick of this mean, as a line through them does; `None` if
-/// it runs the other way.
-fn borrow(sequence: &SequenceRange, brick: &Brick, mean: f64, referenced: &Lender) -> Option<BrickRange> {
-    let (values, texels) = (&brick.values, &referenced.texels);
-    let product = sum(|i| (f64::from(values[i]) - mean) * (f64::from(texels[i]) - referenced.mean));
-    let (lo, span) = (f64::from(sequence.lo), f64::from(sequence.span));
-    let gain = product / referenced.energy;
-    let min = ((mean - gain * referenced.mean - lo) / span * 65535.0).round().clamp(0.0, 65535.0);
-    // The minimum is coarse and may have met an end of the range: the extent makes the best of it.
-    let rest = lo + span * min / 65535.0;
-    let dot = sum(|i| (f64::from(values[i]) - rest) * f64::from(texels[i]));
-    let extent = Half::from_f64(dot / referenced.squares / span);
-    let is_ahead = extent.is_finite() && extent > Half::ZERO;
-    is_ahead.then_some(BrickRange { min: min as u16, extent })
 }

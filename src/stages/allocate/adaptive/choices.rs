@@ -5,8 +5,8 @@ use std::collections::HashMap;
 use bytemuck::{Pod, Zeroable};
 use rayon::prelude::*;
 
-use super::borrow::TexelReference;
 use super::candidate::{Candidate, PerCandidate};
+use super::offers::TexelReference;
 use crate::codec::TexelCodec;
 use crate::stages::encoder_cache::{Cost, EncoderCache, Trial};
 use crate::volume::{SCRATCH_SMALL, Scratch, ScratchFolder, ScratchResult};
