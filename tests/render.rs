@@ -13,7 +13,7 @@ use volpack::pack::layout::{Section, kind};
 use volpack::pipeline::build_altered;
 use volpack::render::{
     Camera, DecodedFrame, Device, Image, Interpolation, Mode, Renderer, Scene, Traversal, View, WorldBox,
-    apart, difference, trace, trace_noting_bc4, write_png,
+    apart, difference, trace, trace_noting_gpu_spread, write_png,
 };
 use volpack::settings::{Format, Settings};
 use volpack::volume::{Cell, CellContent, Child, Constant, Coord, CoordBox, FlatFrame, ValueRange};
@@ -139,16 +139,16 @@ fn the_shader_sees_what_the_cpu_sees() {
                     }
                     let scene = scene(&pack, &field, mode, traversal, interpolation);
                     let ours = gpu.trace(&uploaded, [0, frame as u32], field.bounds, &scene).unwrap();
-                    let (twin, reads_bc4) = trace_noting_bc4::<f32>(&field, &scene).unwrap();
+                    let (twin, varies) = trace_noting_gpu_spread::<f32>(&field, &scene).unwrap();
                     // The interpolation of BC4 is each GPU's own: 0.03 of a block's range.
-                    let tolerance = |pixel: usize| if reads_bc4[pixel] { 0.03 } else { 1e-5 };
+                    let tolerance = |pixel: usize| if varies[pixel] { 0.03 } else { 1e-5 };
                     let (n, most) = differing_by(&twin, &ours, 0..4, tolerance);
                     // In a category a ray that meets an edge may go to either side: 0.1 % of pixels. Thousands of voxels
                     // away, the last bit of an f32 direction is a thousandth of a voxel: there rays tie in measures too.
-                    let pixels = reads_bc4.len();
+                    let pixels = varies.len();
                     let ties = if mode.is_categorical() || VAST.contains(&name) { pixels / 1000 } else { 0 };
                     // BC4 moves edges, and with them hits; of the nearest voxels one of another sign is several pixels.
-                    let of_bc4 = reads_bc4.iter().filter(|bc4| **bc4).count();
+                    let of_bc4 = varies.iter().filter(|bc4| **bc4).count();
                     let part = if interpolation == Interpolation::Nearest { 100 } else { 200 };
                     let allowed = ties + (pixels / part).min(of_bc4);
                     assert!(

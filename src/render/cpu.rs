@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::camera::{dot, normalise};
 use super::decoded_frame::{Content, DecodedFrame};
 use super::image::{Image, apart, opacity};
-pub(super) use super::scene::{AMBIENT, Scene, Setup, TraceError};
+use super::scene::{AMBIENT, Scene, Setup, TraceError};
 use super::surface::{cubic, evaluate, first_change};
 use super::traverse::{Box3, Ray, Real, Walk};
 use super::{Mode, Traversal};
@@ -23,14 +23,14 @@ const MAX_STEPS: u32 = 1 << 16;
 /// # Errors
 /// [`TraceError`].
 pub fn trace<F: Real>(frame: &DecodedFrame, scene: &Scene) -> Result<Image, TraceError> {
-    Ok(trace_noting_bc4::<F>(frame, scene)?.0)
+    Ok(trace_noting_gpu_spread::<F>(frame, scene)?.0)
 }
 
-/// The same, and for each pixel whether its rays read a brick of BC4, whose values are each GPU's own.
+/// The same, and for each pixel whether its rays read a brick whose texels GPUs decode differently: BC4.
 ///
 /// # Errors
 /// [`TraceError`].
-pub fn trace_noting_bc4<F: Real>(
+pub fn trace_noting_gpu_spread<F: Real>(
     frame: &DecodedFrame,
     scene: &Scene,
 ) -> Result<(Image, Vec<bool>), TraceError> {
@@ -38,8 +38,8 @@ pub fn trace_noting_bc4<F: Real>(
     let tracer = Tracer::<F>::new(frame, scene, &setup);
     let [width, height] = scene.size;
     let pixels = (0..width * height).into_par_iter().map(|i| tracer.pixel(i % width, i / width));
-    let (pixels, reads_bc4) = pixels.unzip();
-    Ok((Image { size: scene.size, pixels }, reads_bc4))
+    let (pixels, varies) = pixels.unzip();
+    Ok((Image { size: scene.size, pixels }, varies))
 }
 
 /// How far arithmetic decides what these pixels (y · width + x) are: the most by which one changes where its ray and the
@@ -81,7 +81,7 @@ pub fn optical_depths<F: Real>(frame: &DecodedFrame, scene: &Scene) -> Result<Ve
 #[derive(Default)]
 struct Visited {
     steps: u32,
-    reads_bc4: bool,
+    varies: bool,
 }
 
 #[derive(Clone, Copy)]
@@ -140,7 +140,7 @@ impl<'a, F: Real> Tracer<'a, F> {
         };
         let steps = visited.steps as f32;
         let [r, g, b] = if self.scene.mode == Mode::Steps { [steps; 3] } else { color };
-        ([r, g, b, steps], visited.reads_bc4)
+        ([r, g, b, steps], visited.varies)
     }
 
     /// The voxel that a cell is, or has as its first corner.
@@ -161,7 +161,7 @@ impl<'a, F: Real> Tracer<'a, F> {
         let (constant, value) = match found.content {
             Content::Constant(constant) => (true, constant.value),
             Content::Brick(brick) => {
-                visited.reads_bc4 |= brick.uncertainty > 0.0;
+                visited.varies |= brick.uncertainty > 0.0;
                 let value = brick.values[voxel.child_index(3, 1)];
                 (
                     false,

@@ -10,8 +10,8 @@ use wgpu::util::DeviceExt;
 
 use self::params::Params;
 use self::pipelines::{Has, Pipelines, WORKGROUP};
-use super::cpu::Scene;
 use super::image::Image;
+use super::scene::Scene;
 use crate::codec::{Codec, TextureFormat};
 use crate::pack::{Atlas, Pack};
 use crate::volume::CoordBox;

@@ -1,6 +1,6 @@
 //! Why a GPU cannot trace: with the wgpu tracer and without.
 
-use super::cpu::TraceError;
+use super::scene::TraceError;
 use crate::pack::PackError;
 
 /// Why a GPU cannot trace a pack.

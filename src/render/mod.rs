@@ -25,7 +25,7 @@ mod surface;
 mod traverse;
 
 pub use camera::{Camera, CameraError, Lens, View, WorldBox};
-pub use cpu::{optical_depths, spread, trace, trace_noting_bc4};
+pub use cpu::{optical_depths, spread, trace, trace_noting_gpu_spread};
 pub use decoded_frame::DecodedFrame;
 pub use image::{Difference, Image, apart, difference, write_apng, write_png};
 pub use renderer::{Device, Renderer};

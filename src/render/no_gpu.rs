@@ -2,8 +2,8 @@
 
 use std::convert::Infallible;
 
-use super::cpu::Scene;
 use super::image::Image;
+use super::scene::Scene;
 use crate::pack::Pack;
 use crate::volume::CoordBox;
 

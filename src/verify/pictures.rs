@@ -16,7 +16,7 @@ use crate::error::{Error, Result};
 use crate::pack::{Grid, Pack};
 use crate::render::{
     DecodedFrame, Device, Difference, Image, Mode, Renderer, Scene, TraceError, View, apart, difference,
-    optical_depths, spread, trace, trace_noting_bc4, write_png,
+    optical_depths, spread, trace, trace_noting_gpu_spread, write_png,
 };
 use crate::vdb::{VdbFile, with_scalar_type};
 
@@ -27,9 +27,9 @@ const FRAMES: usize = 3;
 /// How far the two tracers may be apart, of the larger number or of 1: `f32` sums a few hundred
 /// segments.
 const TRACER_TOLERANCE: f32 = 1e-5;
-/// The same for pixels whose rays read BC4, whose interpolation is each GPU's own: 0.03 of the distance of a
+/// The same for pixels whose rays read texels that GPUs decode differently, which is BC4: 0.03 of the distance of a
 /// block's endpoints.
-const BC4_TOLERANCE: f32 = 0.03;
+const VARYING_TOLERANCE: f32 = 0.03;
 /// How much further, of what moving the ray by rounding changes on the CPU: sixteen ways to move it are not all ways.
 const SPREAD_TOLERANCE: f32 = 2.0;
 /// The part of pixels that may be further apart: rays that meet an edge, where rounding decides.
@@ -175,7 +175,7 @@ fn compare_grid(
         let scene = Scene { extinction, ..scene };
         let of_source = of_source.at(&scene);
         let field = packed_field(pack, [g, f])?;
-        let (of_pack, reads_bc4) = match trace_noting_bc4::<f32>(&field, &scene) {
+        let (of_pack, varies) = match trace_noting_gpu_spread::<f32>(&field, &scene) {
             Ok(traced) => traced,
             Err(e) => {
                 report.not_compared.push(format!("{}: {e}", what(f)));
@@ -188,7 +188,7 @@ fn compare_grid(
         }
         let tracers = if renderer.is_gpu() {
             let of_gpu = renderer.render(g, f, &scene).map_err(|e| Error::Other(e.to_string()))?;
-            let found = tracer_difference(&of_gpu, &of_pack, &reads_bc4, &field, &scene);
+            let found = tracer_difference(&of_gpu, &of_pack, &varies, &field, &scene);
             Some(found.map_err(|e| Error::Other(e.to_string()))?)
         } else {
             None
@@ -345,12 +345,12 @@ pub fn look(
 fn tracer_difference(
     of_gpu: &Image,
     of_cpu: &Image,
-    reads_bc4: &[bool],
+    varies: &[bool],
     field: &DecodedFrame,
     scene: &Scene,
 ) -> Result<TracerDifference, TraceError> {
     let apart = |pixel: usize| apart(&of_gpu.pixels[pixel][..3], &of_cpu.pixels[pixel][..3]);
-    let tolerance = |pixel: usize| if reads_bc4[pixel] { BC4_TOLERANCE } else { TRACER_TOLERANCE };
+    let tolerance = |pixel: usize| if varies[pixel] { VARYING_TOLERANCE } else { TRACER_TOLERANCE };
     let pixels = of_cpu.pixels.len();
     let (far, close): (Vec<usize>, Vec<usize>) =
         (0..pixels).partition(|&pixel| apart(pixel) > tolerance(pixel));

@@ -2,7 +2,7 @@
 
 use bytemuck::{Pod, Zeroable};
 
-use crate::render::cpu::{AMBIENT, Scene, Setup, TraceError};
+use crate::render::scene::{AMBIENT, Scene, Setup, TraceError};
 use crate::volume::CoordBox;
 
 /// `struct Params` of `tracer.wgsl`: vectors of three are aligned to four words, and numbers fill the gaps.
