@@ -61,6 +61,9 @@ fn build_with(job: &Job, alter: Option<Alter>, progress: &mut dyn Progress) -> R
     // Also after an error: what was done until then is there for the next build.
     let warnings = cache.map(|cache| cache.flush()).unwrap_or_default();
     warnings.iter().for_each(|warning| progress.warn(warning));
+    if let Ok(outcome) = &mut outcome {
+        outcome.warnings.extend(warnings);
+    }
     outcome
 }
 

@@ -72,7 +72,7 @@ pub enum Content<'a> {
 type PutConstant = fn(&mut DecodedFrame, Coord, Constant);
 
 /// How a tree's values are read.
-struct Source<F> {
+struct TreeValues<F> {
     background: f32,
     value: F,
 }
@@ -86,7 +86,7 @@ enum Leaf {
     Voxels(Box<[f32; BRICK_VOXELS]>),
 }
 
-impl<F> Source<F> {
+impl<F> TreeValues<F> {
     fn value<T: Scalar>(&self, value: T, active: bool) -> f32
     where
         F: Fn(T) -> f32,
@@ -138,7 +138,7 @@ impl DecodedFrame {
 
     /// A frame of the source, whose values become what `value` makes of them.
     pub fn from_tree<T: Scalar>(tree: &Tree<T>, value: impl Fn(T) -> f32 + Sync) -> Self {
-        let source = Source { background: value(tree.background) + 0.0, value };
+        let source = TreeValues { background: value(tree.background) + 0.0, value };
         let mut field = Self::empty(source.background);
         for tile in &tree.tiles {
             if let Some(constant) = source.tile(tile.value, tile.active) {

@@ -158,12 +158,12 @@ fn run(options: &[&str], from: &Path, to: &Path) -> Result<f64, NanoError> {
 }
 
 /// A file read here and there, never whole: a grid of floats may be larger than memory.
-struct Source<R> {
+struct SeekableFile<R> {
     file: R,
     length: u64,
 }
 
-impl<R: Read + Seek> Source<R> {
+impl<R: Read + Seek> SeekableFile<R> {
     fn fill(&mut self, at: u64, into: &mut [u8]) -> Result<(), Flaw> {
         within("a field", at, into.len() as u64, self.length)?;
         self.file.seek(SeekFrom::Start(at))?;
@@ -191,7 +191,7 @@ fn same(what: &'static str, found: u64, expected: u64) -> Result<(), Flaw> {
 /// The sizes (in no time) of the one grid in a `.nvdb` file.
 fn read<R: Read + Seek>(mut file: R, quantise: &Quantise) -> Result<NanoGrid, Flaw> {
     let length = file.seek(SeekFrom::End(0))?;
-    let file = &mut Source { file, length };
+    let file = &mut SeekableFile { file, length };
     same("the file's magic number", file.number::<8>(0)?, MAGIC)?;
     same("the major version", file.number::<4>(8)? >> 21, MAJOR)?; // Packed as 11, 11 and 10 bits.
     same("the number of grids", file.number::<2>(12)?, 1)?;

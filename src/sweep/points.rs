@@ -31,7 +31,7 @@ const FPN: [f64; 6] = [0.1, 0.05, 0.02, 0.01, 0.005, 0.002];
 pub fn measure(options: &Options, progress: &mut dyn Progress) -> Result<Sweep> {
     let scratch = tempfile::tempdir().map_err(Error::io(std::env::temp_dir()))?;
     let gpu = options.trace.and_then(|_| Gpu::shared().ok()).filter(|gpu| !gpu.is_software);
-    let source = Source::read(options)?;
+    let source = Reference::read(options)?;
     let methods = options.methods();
     let (mut points, mut skipped) =
         each(&methods, progress, |method| point(options, method, &source, scratch.path(), gpu))?;
@@ -67,7 +67,7 @@ fn peers(peak: f64) -> Vec<(&'static str, String, Quantise)> {
 }
 
 /// What all methods are measured against.
-struct Source {
+struct Reference {
     grid: String,
     peak: f64,
     /// Some frames, by their place among the files.
@@ -75,7 +75,7 @@ struct Source {
     jumps: Jumps,
 }
 
-impl Source {
+impl Reference {
     fn read(options: &Options) -> Result<Self> {
         let sequence =
             crate::stages::metadata::read(&options.frames, crate::stages::metadata::Digests::default())?;
@@ -115,7 +115,7 @@ pub(super) fn flat_frame(path: &Path, grid: &str, options: &Options) -> Result<O
 fn point(
     options: &Options,
     method: &Method,
-    source: &Source,
+    source: &Reference,
     folder: &Path,
     gpu: Option<&Gpu>,
 ) -> Result<Point> {
@@ -180,7 +180,7 @@ fn trace(gpu: &Gpu, pack: &Pack, size: [u32; 2], repeats: u32) -> Option<f64> {
 /// A peer's figures, all frames together.
 fn nano_point(
     options: &Options,
-    source: &Source,
+    source: &Reference,
     (method, setting): (&str, &str),
     quantise: &Quantise,
     folder: &Path,

@@ -31,7 +31,7 @@ impl Compression {
 
 /// How every block of one grid is stored.
 #[derive(Clone, Copy)]
-pub(super) struct Layout<T> {
+pub(super) struct BlockLayout<T> {
     pub compression: Compression,
     pub half: bool,
     pub background: T,
@@ -62,16 +62,16 @@ enum Packing {
 
 /// A thread's buffers for [`Block::decode`].
 #[derive(Default)]
-pub(super) struct Scratch {
+pub(super) struct DecodeBuffers {
     bytes: Vec<u8>,
-    blosc: blosc::Scratch,
+    blosc: blosc::BloscBuffers,
     decompressors: Decompressors,
 }
 
 impl<'a, T: Value> Block<'a, T> {
     /// Finds the block at the cursor and leaves the cursor behind it. `active` is the node's value
     /// mask, `total` its number of values.
-    pub fn find(c: &mut Cursor<'a>, layout: &Layout<T>, active: &[u64], total: usize) -> Result<Self> {
+    pub fn find(c: &mut Cursor<'a>, layout: &BlockLayout<T>, active: &[u64], total: usize) -> Result<Self> {
         let at = c.at();
         // The enum at the top of io/Compression.h:
         // 0 inactive values are the background, or there are none; 1 all minus the background;
@@ -133,13 +133,13 @@ impl<'a, T: Value> Block<'a, T> {
     /// Decodes into `out`, the node's whole table. `active` as in [`Block::find`].
     pub fn decode(
         &self,
-        layout: &Layout<T>,
+        layout: &BlockLayout<T>,
         active: &[u64],
         out: &mut [T],
-        scratch: &mut Scratch,
+        buffers: &mut DecodeBuffers,
     ) -> Result<()> {
         let size = if layout.half { T::HALF_SIZE } else { T::SIZE };
-        let bytes = self.unpack(self.count * size, scratch)?;
+        let bytes = self.unpack(self.count * size, buffers)?;
         let read = if layout.half { T::from_half_le } else { T::from_le };
         if self.count == out.len() {
             for (value, bytes) in out.iter_mut().zip(bytes.chunks_exact(size)) {
@@ -162,8 +162,8 @@ impl<'a, T: Value> Block<'a, T> {
         Ok(())
     }
 
-    fn unpack<'s>(&'s self, len: usize, scratch: &'s mut Scratch) -> Result<&'s [u8]> {
-        let Scratch { bytes, blosc, decompressors } = scratch;
+    fn unpack<'s>(&'s self, len: usize, buffers: &'s mut DecodeBuffers) -> Result<&'s [u8]> {
+        let DecodeBuffers { bytes, blosc, decompressors } = buffers;
         match self.packing {
             Packing::Raw => return Ok(self.payload),
             Packing::Blosc => {

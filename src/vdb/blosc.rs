@@ -27,7 +27,7 @@ const FLAG_DONT_SPLIT: u8 = 0x10;
 
 /// Buffers that are kept between calls, so that a leaf costs no allocation.
 #[derive(Default)]
-pub(super) struct Scratch {
+pub(super) struct BloscBuffers {
     whole: Vec<u8>,
     shuffled: Vec<u8>,
 }
@@ -37,7 +37,7 @@ pub(super) fn decompress(
     at: u64,
     src: &[u8],
     out: &mut [u8],
-    scratch: &mut Scratch,
+    buffers: &mut BloscBuffers,
     decompressors: &mut Decompressors,
 ) -> Result<()> {
     let damaged = |what: String| Err(VdbError::corrupt(at, what));
@@ -77,7 +77,7 @@ pub(super) fn decompress(
         return damaged(format!("Blosc blocks of {block_len} in {raw_len} bytes"));
     }
 
-    let Scratch { whole, shuffled } = scratch;
+    let BloscBuffers { whole, shuffled } = buffers;
     whole.resize(raw_len, 0);
     for (i, block) in whole.chunks_mut(block_len).enumerate() {
         let start = src

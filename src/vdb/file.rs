@@ -38,11 +38,11 @@ pub struct VdbFile {
     pub warnings: Vec<String>,
     /// Whether it says where each grid ends.
     has_offsets: bool,
-    source: Source,
+    source: FileBytes,
 }
 
 #[derive(Debug)]
-enum Source {
+enum FileBytes {
     File { file: Mutex<File>, len: u64 },
     Memory(Vec<u8>),
 }
@@ -59,7 +59,7 @@ impl VdbFile {
         }
         let file = File::open(path)?;
         let len = file.metadata()?.len();
-        Self::from_source(Source::File { file: Mutex::new(file), len })
+        Self::from_source(FileBytes::File { file: Mutex::new(file), len })
     }
 
     /// The same for a file that is in memory.
@@ -67,16 +67,16 @@ impl VdbFile {
     /// # Errors
     /// As [`VdbFile::open`].
     pub fn from_bytes(bytes: Vec<u8>) -> Result<Self> {
-        Self::from_source(Source::Memory(bytes))
+        Self::from_source(FileBytes::Memory(bytes))
     }
 
-    fn from_source(source: Source) -> Result<Self> {
+    fn from_source(source: FileBytes) -> Result<Self> {
         let (version, at) = source.parse(0, read_version)?;
         Self::read_contents(source, version, at).map_err(|e| e.in_version(version))
     }
 
     /// Reads what lies behind the version.
-    fn read_contents(source: Source, version: u32, at: u64) -> Result<Self> {
+    fn read_contents(source: FileBytes, version: u32, at: u64) -> Result<Self> {
         let (Header { library, has_offsets, metadata, grid_count }, at) = source.parse(at, Header::read)?;
         let mut warnings = Vec::new();
         if version > NEWEST {
@@ -90,7 +90,7 @@ impl VdbFile {
         } else {
             // Without offsets the only way to a grid is through all before it.
             let bytes = source.range(0..source.len())?.into_owned();
-            (read_streamed_grids(&bytes, at, grid_count, &mut warnings)?, Source::Memory(bytes))
+            (read_streamed_grids(&bytes, at, grid_count, &mut warnings)?, FileBytes::Memory(bytes))
         };
         Ok(Self { version, library, metadata, grids, warnings, has_offsets, source })
     }
@@ -202,7 +202,7 @@ impl Header {
     }
 }
 
-fn read_grids(source: &Source, mut at: u64, count: u32) -> Result<Vec<GridInfo>> {
+fn read_grids(source: &FileBytes, mut at: u64, count: u32) -> Result<Vec<GridInfo>> {
     let mut grids = Vec::new();
     for _ in 0..count {
         let (descriptor, behind) = source.parse(at, Descriptor::read)?;
@@ -280,7 +280,7 @@ fn skip_tree(c: &mut Cursor, grid: &GridInfo) -> Result<bool> {
     )
 }
 
-impl Source {
+impl FileBytes {
     fn len(&self) -> u64 {
         match self {
             Self::File { len, .. } => *len,

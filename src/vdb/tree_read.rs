@@ -4,7 +4,7 @@ use std::collections::HashSet;
 
 use rayon::prelude::*;
 
-use super::block::{Block, Layout, Scratch};
+use super::block::{Block, BlockLayout, DecodeBuffers};
 use super::cursor::Cursor;
 use super::grid::GridInfo;
 use super::tree::{Internal, LEAVES_IN_BLOCK, Leaves, RootTile, Tree};
@@ -26,7 +26,7 @@ pub(super) fn read_background<T: Value>(c: &mut Cursor) -> Result<T> {
 /// and tile values, but no leaf values.
 pub(super) fn read_topology<T: Value>(c: &mut Cursor, grid: &GridInfo) -> Result<Tree<T>> {
     let background = read_background(c)?;
-    let mut reader = Reader { layout: layout(grid, background), scratch: Scratch::default() };
+    let mut reader = Reader { layout: layout(grid, background), buffers: DecodeBuffers::default() };
     let mut tree = Tree {
         background,
         tiles: Vec::new(),
@@ -49,8 +49,8 @@ pub(super) fn read_topology<T: Value>(c: &mut Cursor, grid: &GridInfo) -> Result
     Ok(tree)
 }
 
-fn layout<T>(grid: &GridInfo, background: T) -> Layout<T> {
-    Layout { compression: grid.compression, half: grid.half, background }
+fn layout<T>(grid: &GridInfo, background: T) -> BlockLayout<T> {
+    BlockLayout { compression: grid.compression, half: grid.half, background }
 }
 
 /// Root entries must lie on the 4096 grid and not share a place: everything downstream relies on
@@ -74,8 +74,8 @@ fn root_origin(c: &mut Cursor, seen: &mut HashSet<Coord>) -> Result<Coord> {
 }
 
 struct Reader<T> {
-    layout: Layout<T>,
-    scratch: Scratch,
+    layout: BlockLayout<T>,
+    buffers: DecodeBuffers,
 }
 
 impl<T: Value> Reader<T> {
@@ -106,7 +106,7 @@ impl<T: Value> Reader<T> {
         let mut active = mask(c, count)?;
         let block = Block::find(c, &self.layout, &active, count)?;
         let mut tiles = vec![T::default(); count].into_boxed_slice();
-        block.decode(&self.layout, &active, &mut tiles, &mut self.scratch)?;
+        block.decode(&self.layout, &active, &mut tiles, &mut self.buffers)?;
         // OpenVDB reads a child that claims to be an active tile too as the node that it is.
         for (active, child) in active.iter_mut().zip(&children) {
             *active &= !child;
@@ -140,7 +140,7 @@ pub(super) fn read_leaves<T: Value>(c: &mut Cursor, grid: &GridInfo, tree: &mut 
     }
 
     let start = &*c;
-    let decode = |scratch: &mut Scratch, (masks, places): (&mut [Mask512], &[usize])| {
+    let decode = |buffers: &mut DecodeBuffers, (masks, places): (&mut [Mask512], &[usize])| {
         let mut block = vec![T::default(); masks.len() * BRICK_VOXELS];
         let leaves = block.as_chunks_mut::<BRICK_VOXELS>().0.iter_mut();
         for ((values, mask), &place) in leaves.zip(masks).zip(places) {
@@ -148,12 +148,12 @@ pub(super) fn read_leaves<T: Value>(c: &mut Cursor, grid: &GridInfo, tree: &mut 
             // The mask before the values is the one that counts: OpenVDB overwrites the other.
             *mask = Mask512::from_bytes(c.array("a leaf's mask")?);
             let found = Block::find(&mut c, &layout, &mask.0, BRICK_VOXELS)?;
-            found.decode(&layout, &mask.0, values, scratch)?;
+            found.decode(&layout, &mask.0, values, buffers)?;
         }
         Ok(block)
     };
     let masks = tree.leaves.masks.par_chunks_mut(LEAVES_IN_BLOCK);
-    let blocks = masks.zip(places.par_chunks(LEAVES_IN_BLOCK)).map_init(Scratch::default, decode);
+    let blocks = masks.zip(places.par_chunks(LEAVES_IN_BLOCK)).map_init(DecodeBuffers::default, decode);
     tree.leaves.blocks = blocks.collect::<Result<_>>()?;
     Ok(())
 }

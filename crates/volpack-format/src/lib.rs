@@ -47,7 +47,7 @@ mod half;
 pub mod layout;
 mod mask;
 mod pack;
-mod source;
+mod pack_bytes;
 mod tables;
 pub mod tree;
 mod value;

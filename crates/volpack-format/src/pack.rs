@@ -13,7 +13,7 @@ use crate::codec::Codec;
 use crate::error::{corrupt, ensure};
 use crate::grid::{Frame, Grid};
 use crate::layout::{AtlasRecord, Chunk, FrameRecord, GridRecord, Section, encoding, kind};
-use crate::source::Source;
+use crate::pack_bytes::PackBytes;
 use crate::tables::{fits_memory, read_tables};
 use crate::tree::header;
 use crate::{Atlas, PackError, check, zstd};
@@ -25,7 +25,7 @@ use crate::{Atlas, PackError, check, zstd};
 /// numbers the rules.
 pub struct Pack {
     path: PathBuf,
-    source: Source,
+    source: PackBytes,
     grids: Vec<Grid>,
     tree: Vec<u32>,
     atlases: Vec<Atlas>,
@@ -44,7 +44,7 @@ impl Pack {
     /// [`PackError`].
     #[cfg(feature = "mmap")]
     pub fn open(path: &Path) -> Result<Self, PackError> {
-        Self::parse(path.to_owned(), Source::map(path)?)
+        Self::parse(path.to_owned(), PackBytes::map(path)?)
     }
 
     /// The same for a pack that is in memory.
@@ -52,7 +52,7 @@ impl Pack {
     /// # Errors
     /// [`PackError`].
     pub fn from_bytes(bytes: Vec<u8>) -> Result<Self, PackError> {
-        Self::parse(PathBuf::from("(in memory)"), Source::Memory(bytes))
+        Self::parse(PathBuf::from("(in memory)"), PackBytes::Memory(bytes))
     }
 
     /// The same for a stream, which a pack begins and ends with: a file, or a client of a server that gives parts of one.
@@ -61,7 +61,7 @@ impl Pack {
     /// # Errors
     /// [`PackError`].
     pub fn from_reader(stream: impl Read + Seek + Send + 'static) -> Result<Self, PackError> {
-        Self::parse(PathBuf::from("(a stream)"), Source::stream(stream)?)
+        Self::parse(PathBuf::from("(a stream)"), PackBytes::stream(stream)?)
     }
 
     /// The grids.
@@ -102,7 +102,7 @@ impl Pack {
         self.records(kind::PROVENANCE)
     }
 
-    fn parse(path: PathBuf, source: Source) -> Result<Self, PackError> {
+    fn parse(path: PathBuf, source: PackBytes) -> Result<Self, PackError> {
         let (sections, chunks) = read_tables(&source)?;
         let mut pack = Self {
             checked: chunks.iter().map(|_| AtomicBool::new(false)).collect(),

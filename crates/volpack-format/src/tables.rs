@@ -8,7 +8,7 @@ use bytemuck::allocation::pod_collect_to_vec;
 use crate::PackError;
 use crate::error::{corrupt, ensure};
 use crate::layout::{ALIGNMENT, Chunk, Header, MAGIC, Section, VERSION, encoding, kind};
-use crate::source::Source;
+use crate::pack_bytes::PackBytes;
 
 /// Rule 10: what one chunk may take in memory. Those that volpack writes have at most 256 KiB.
 const MAX_CHUNK: u32 = 16 << 20;
@@ -34,7 +34,7 @@ pub fn tables_digest(header: &Header, sections: &[Section], chunks: &[Chunk]) ->
 }
 
 /// Reads header, sections and chunks and checks that they agree with the file and each other.
-pub(crate) fn read_tables(source: &Source) -> Result<(Vec<Section>, Vec<Chunk>), PackError> {
+pub(crate) fn read_tables(source: &PackBytes) -> Result<(Vec<Section>, Vec<Chunk>), PackError> {
     let have = source.len();
     let first = source.read(0, have.min(size_of::<Header>() as u64))?;
     if !first.starts_with(&MAGIC) {

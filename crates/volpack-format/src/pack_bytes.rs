@@ -6,12 +6,12 @@ use std::sync::{Mutex, PoisonError};
 
 use crate::PackError;
 
-/// What [`Source::Stream`] needs of a stream.
+/// What [`PackBytes::Stream`] needs of a stream.
 pub(crate) trait ReadSeek: Read + Seek + Send {}
 impl<T: Read + Seek + Send> ReadSeek for T {}
 
 /// A pack's bytes.
-pub(crate) enum Source {
+pub(crate) enum PackBytes {
     /// All of them.
     Memory(Vec<u8>),
     /// The same, by the operating system.
@@ -26,7 +26,7 @@ pub(crate) enum Source {
     },
 }
 
-impl Source {
+impl PackBytes {
     /// Maps a file.
     #[cfg(feature = "mmap")]
     #[allow(unsafe_code)]
