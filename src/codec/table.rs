@@ -88,32 +88,37 @@ const _: () = {
     assert!(matches!(TABLE[i].cache, CachePolicy::Exact));
 };
 
-/// A codec that has texels: one that a build can choose. In cache keys it is its tag less one.
+/// A codec that has texels: one that a build can choose. The number is its place in the table, which searches look up more
+/// than anything else.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct TexelCodec(Codec);
+pub struct TexelCodec(u8);
 
 impl TexelCodec {
     /// All of them, by ascending bits.
     pub const ALL: [Self; TABLE.len()] = {
-        let mut all = [Self(Codec::Constant); TABLE.len()];
+        let mut all = [Self(0); TABLE.len()];
         let mut i = 0;
         while i < all.len() {
-            all[i] = Self(TABLE[i].codec);
+            all[i] = Self(i as u8);
             i += 1;
         }
         all
     };
 
     /// BC7.
-    pub const BC7: Self = Self(Codec::Bc7);
+    pub const BC7: Self = Self::named(Codec::Bc7);
     /// BC4.
-    pub const BC4: Self = Self(Codec::Bc4);
+    pub const BC4: Self = Self::named(Codec::Bc4);
     /// One byte a voxel.
-    pub const UNORM8: Self = Self(Codec::Unorm8);
+    pub const UNORM8: Self = Self::named(Codec::Unorm8);
     /// Half floats.
-    pub const F16: Self = Self(Codec::F16);
+    pub const F16: Self = Self::named(Codec::F16);
     /// Floats.
-    pub const F32: Self = Self(Codec::F32);
+    pub const F32: Self = Self::named(Codec::F32);
+
+    const fn named(codec: Codec) -> Self {
+        Self::of(codec).expect("it is in the table")
+    }
 
     /// The one without error, which any brick can have.
     pub const EXACT: Self = Self::ALL[Self::ALL.len() - 1];
@@ -124,7 +129,7 @@ impl TexelCodec {
         let (mut i, mut next) = (0, 0);
         while i < TABLE.len() {
             if matches!(TABLE[i].cache, CachePolicy::ErrorOnly(_)) {
-                found[next] = Self(TABLE[i].codec);
+                found[next] = Self(i as u8);
                 next += 1;
             }
             i += 1;
@@ -141,39 +146,35 @@ impl TexelCodec {
         count
     }
 
-    /// For each tag, the place in [`Self::ALL`].
-    const PLACES: [usize; Codec::COUNT] = {
-        let mut places = [usize::MAX; Codec::COUNT];
-        let mut i = 0;
-        while i < TABLE.len() {
-            places[TABLE[i].codec as usize] = i;
-            i += 1;
-        }
-        places
-    };
-
     /// A codec, if it has texels.
     pub const fn of(codec: Codec) -> Option<Self> {
-        if Self::PLACES[codec as usize] < TABLE.len() { Some(Self(codec)) } else { None }
-    }
-
-    /// As one of all codecs.
-    pub const fn codec(self) -> Codec {
-        self.0
+        let mut i = 0;
+        while i < TABLE.len() {
+            if TABLE[i].codec as u8 == codec as u8 {
+                return Some(Self(i as u8));
+            }
+            i += 1;
+        }
+        None
     }
 
     /// Its place in [`Self::ALL`].
     pub const fn index(self) -> usize {
-        Self::PLACES[self.0 as usize]
+        self.0 as usize
     }
 
-    fn row(self) -> &'static Row {
+    const fn row(self) -> &'static Row {
         &TABLE[self.index()]
+    }
+
+    /// As one of all codecs.
+    pub const fn codec(self) -> Codec {
+        self.row().codec
     }
 
     /// Its name in manifests and reports.
     pub const fn name(self) -> &'static str {
-        self.0.name()
+        self.codec().name()
     }
 
     /// What the help says of it.
@@ -224,7 +225,7 @@ impl TexelCodec {
 
 impl Serialize for TexelCodec {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        // What the keys of caches have had since codecs were first kept.
-        serializer.serialize_u32(self.0 as u32 - 1)
+        // In keys of the cache, where a codec has had this number from the first: its tag less one.
+        serializer.serialize_u32(self.codec() as u32 - 1)
     }
 }

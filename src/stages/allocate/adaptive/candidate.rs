@@ -52,9 +52,10 @@ impl Candidate {
     /// Its place among those.
     pub fn own_error_index(self) -> Option<usize> {
         match self {
-            Self::Borrowed | Self::EXACT => None,
+            Self::Borrowed => None,
             Self::Empty | Self::Constant => Some(self.index()),
-            Self::Texels(_) => Some(self.index() - 1),
+            // The exact one is the last.
+            Self::Texels(_) => Some(self.index() - 1).filter(|index| *index < Self::WITH_OWN_ERROR),
         }
     }
 
