@@ -21,7 +21,7 @@ const SEQUENCES: u64 = 300;
 
 /// What a sequence's values look like.
 #[derive(Clone, Copy, Debug)]
-enum DecodedFrame {
+enum Field {
     /// Smooth noise that moves.
     Noise,
     /// The same above and below 0.
@@ -36,7 +36,7 @@ enum DecodedFrame {
     LevelSet,
 }
 
-impl DecodedFrame {
+impl Field {
     const ALL: [Self; 6] = [Self::Noise, Self::Signed, Self::Bricks, Self::Steps, Self::Haze, Self::LevelSet];
 }
 
@@ -49,7 +49,7 @@ struct Wave {
 
 /// One random sequence.
 struct Sequence {
-    field: DecodedFrame,
+    field: Field,
     frames: i32,
     /// Leaves along each axis.
     leaves: [i32; 3],
@@ -71,14 +71,11 @@ struct Sequence {
 impl Sequence {
     fn random(rng: &mut Xoshiro256PlusPlus) -> Self {
         // Bricks twice as often as others: texels that serve several are where most can go wrong.
-        let field = DecodedFrame::ALL
-            .get(rng.gen_range(0..=DecodedFrame::ALL.len()))
-            .copied()
-            .unwrap_or(DecodedFrame::Bricks);
+        let field = Field::ALL.get(rng.gen_range(0..=Field::ALL.len())).copied().unwrap_or(Field::Bricks);
         let leaves = std::array::from_fn(|_| rng.gen_range(1..=4));
         let voxel_size = [0.01, 0.1, 1.0, 12.5][rng.gen_range(0..4)];
         let background = match field {
-            DecodedFrame::LevelSet => (3.0 * voxel_size) as f32,
+            Field::LevelSet => (3.0 * voxel_size) as f32,
             _ => [0.0, 0.0, 0.0, -0.5, 1.0][rng.gen_range(0..5)],
         };
         let wave = |rng: &mut Xoshiro256PlusPlus| Wave {
@@ -123,9 +120,9 @@ impl Sequence {
         let (at, time) = (voxel.map(f64::from), f64::from(frame));
         let noise = || self.noise(at, time);
         let value = match self.field {
-            DecodedFrame::Noise => noise().max(0.0),
-            DecodedFrame::Signed => noise(),
-            DecodedFrame::Bricks => {
+            Field::Noise => noise().max(0.0),
+            Field::Signed => noise(),
+            Field::Bricks => {
                 let inside = voxel.map(|v| f64::from(v & 7));
                 let brick = voxel.map(|v| v >> 3);
                 let which = (brick[0] * 7 + brick[1] * 3 + brick[2] + frame) as usize;
@@ -141,9 +138,9 @@ impl Sequence {
                 };
                 gain * shape + shift
             }
-            DecodedFrame::Steps => (3.0 * noise()).floor() / 3.0,
-            DecodedFrame::Haze => 0.01 * noise().max(0.0) + f64::from(self.distance(at, time) < 2.0),
-            DecodedFrame::LevelSet => {
+            Field::Steps => (3.0 * noise()).floor() / 3.0,
+            Field::Haze => 0.01 * noise().max(0.0) + f64::from(self.distance(at, time) < 2.0),
+            Field::LevelSet => {
                 let distance = (self.distance(at, time) - 6.0) * self.voxel_size;
                 return (distance as f32).clamp(-self.background, self.background);
             }
@@ -153,7 +150,7 @@ impl Sequence {
 
     fn is_active(&self, voxel: [i32; 3], value: f32) -> bool {
         match (self.field, self.activity) {
-            (DecodedFrame::LevelSet, _) => value.abs() < self.background,
+            (Field::LevelSet, _) => value.abs() < self.background,
             (_, 0) => true,
             (_, 1) => value != self.background,
             _ => value != self.background && voxel.iter().all(|v| v & 1 == 0),
@@ -162,7 +159,7 @@ impl Sequence {
 
     /// Writes its frames into a folder.
     fn write(&self, folder: &Path) -> Vec<PathBuf> {
-        let class = if matches!(self.field, DecodedFrame::LevelSet) { "level set" } else { "fog volume" };
+        let class = if matches!(self.field, Field::LevelSet) { "level set" } else { "fog volume" };
         let frame = |frame: i32| {
             let path = folder.join(format!("random_{frame:04}.vdb"));
             let grid = GridFile::new("density", "Tree_float_5_4_3", self.background).of_class(class);
@@ -213,7 +210,7 @@ fn settings(rng: &mut Xoshiro256PlusPlus) -> Vec<Settings> {
 /// Why a good pack may be refused all the same.
 fn may_be_refused(sequence: &Sequence, settings: &Settings, why: &str) -> bool {
     let blocks = matches!(settings.format(), Format::UNORM8 | Format::BC4 | Format::BC7);
-    let is_level_set = matches!(sequence.field, DecodedFrame::LevelSet);
+    let is_level_set = matches!(sequence.field, Field::LevelSet);
     let is_little = ["cannot be reached, the least is", "the pack has none of its", "is under 20 dB"];
     settings.quality().is_size() && is_little.iter().any(|little| why.contains(little))
         || blocks && is_level_set && why.contains("flipped")

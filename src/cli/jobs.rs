@@ -73,7 +73,7 @@ impl JobArgs {
         Ok((all, assets.into_iter().map(|(name, asset)| (name, asset.budget)).collect()))
     }
 
-    /// The packs that are asked for, with the names to show, checked as `verify` says where nothing is said.
+    /// The packs that are asked for, with the names to show. `verify` is the level if the command line has none.
     /// One whose files cannot be found is an error of its own.
     pub fn jobs(
         &self,
@@ -120,8 +120,8 @@ pub fn stem(path: &Path) -> String {
     path.file_stem().map_or_else(|| "pack".into(), |s| s.to_string_lossy().into_owned())
 }
 
-/// Some assets of a manifest, or all of them where none are named, and what all of them together may cost: nothing is
-/// said of some.
+/// Some assets of a manifest, or all of them where none are named, and the budget of all together. That applies only if all
+/// are built.
 pub fn assets(path: &Path, names: &[String]) -> Result<(Vec<(String, Asset)>, Budget)> {
     if !path.exists() {
         return Err(Error::Usage(format!(

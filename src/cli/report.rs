@@ -79,7 +79,7 @@ enum Lines {
     Github,
 }
 
-/// What becomes of assets, one after the other.
+/// Collects the assets' reports and failures.
 struct Gathering<'a> {
     args: &'a ReportArgs,
     common: Common,

@@ -12,7 +12,7 @@ mod table;
 
 use rayon::prelude::*;
 
-pub use table::{CachePolicy, TexelCodec};
+pub use table::{TexelCodec, TrialPolicy};
 pub use volpack_format::Half;
 pub use volpack_format::codec::{
     BrickLayout, BrickRange, Codec, Fidelity, SequenceRange, TextureFormat, decode, spread,

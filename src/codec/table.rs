@@ -1,5 +1,5 @@
-//! All that a build knows of each codec, beside what readers know of it ([`volpack_format::codec`]). A new one is a file
-//! with its encoder and a row here.
+//! All that a build knows of each codec, beside what readers know of it ([`volpack_format::codec`]). A new one is its encoder
+//! and a row here.
 
 use serde::{Serialize, Serializer};
 
@@ -14,20 +14,20 @@ struct Row {
     /// In the help of `--format`.
     help: &'static str,
     encode: fn(&SequenceRange, &[Texels]) -> Result<EncodedBricks, OutOfRange>,
-    cache: CachePolicy,
+    trial: TrialPolicy,
     /// Of its bytes in the report, as CSS has it; from Okabe and Ito's palette.
     color: &'static str,
 }
 
 /// When an adaptive build tries a codec on a brick, and what it keeps of that.
 #[derive(Clone, Copy)]
-pub enum CachePolicy {
+pub enum TrialPolicy {
     /// On every brick. Texels and errors are kept on this machine.
     Always,
     /// On bricks for which the search would choose it, since it is slow. Texels and errors are kept, on remotes too.
     OnDemand,
-    /// On every brick, by rounding values as its texels would; nothing for values that it cannot hold. Only errors are
-    /// kept: texels are as quick to make as to read back.
+    /// On every brick, without its encoder: the function rounds values as texels do, and gives `None` if one does not fit.
+    /// Only errors are kept, because texels are as quick to make as to read back.
     ErrorOnly(fn(&Voxels) -> Option<Voxels>),
     /// On none: there is no error.
     Exact,
@@ -40,7 +40,7 @@ static TABLE: [Row; Codec::WITH_TEXELS.len()] = [
         help: "BC7 blocks, 2 bits per voxel",
         encode: |sequence, bricks| Ok(bc7::encode(sequence, bricks)),
         // Twenty times as long as all others together.
-        cache: CachePolicy::OnDemand,
+        trial: TrialPolicy::OnDemand,
         color: "#009e73",
     },
     Row {
@@ -49,7 +49,7 @@ static TABLE: [Row; Codec::WITH_TEXELS.len()] = [
         encode: |sequence, bricks| {
             Ok(EncodedBricks::without_axes(bc4::encode(sequence, bricks), bricks.len()))
         },
-        cache: CachePolicy::Always,
+        trial: TrialPolicy::Always,
         color: "#0072b2",
     },
     Row {
@@ -58,21 +58,21 @@ static TABLE: [Row; Codec::WITH_TEXELS.len()] = [
         encode: |sequence, bricks| {
             Ok(EncodedBricks::without_axes(plain::encode_unorm8(sequence, bricks), bricks.len()))
         },
-        cache: CachePolicy::Always,
+        trial: TrialPolicy::Always,
         color: "#56b4e9",
     },
     Row {
         codec: Codec::F16,
         help: "16-bit floats, exact where the source is half",
         encode: |_, bricks| Ok(EncodedBricks::without_axes(plain::encode_f16(bricks)?, bricks.len())),
-        cache: CachePolicy::ErrorOnly(plain::round_to_f16),
+        trial: TrialPolicy::ErrorOnly(plain::round_to_f16),
         color: "#cc79a7",
     },
     Row {
         codec: Codec::F32,
         help: "32-bit floats, lossless",
         encode: |_, bricks| Ok(EncodedBricks::without_axes(plain::encode_f32(bricks), bricks.len())),
-        cache: CachePolicy::Exact,
+        trial: TrialPolicy::Exact,
         color: "#d55e00",
     },
 ];
@@ -82,10 +82,10 @@ const _: () = {
     let mut i = 0;
     while i + 1 < TABLE.len() {
         assert!(TABLE[i].codec.layout().brick_bytes() <= TABLE[i + 1].codec.layout().brick_bytes());
-        assert!(!matches!(TABLE[i].cache, CachePolicy::Exact));
+        assert!(!matches!(TABLE[i].trial, TrialPolicy::Exact));
         i += 1;
     }
-    assert!(matches!(TABLE[i].cache, CachePolicy::Exact));
+    assert!(matches!(TABLE[i].trial, TrialPolicy::Exact));
 };
 
 /// A codec that has texels: one that a build can choose. The number is its place in the table, which searches look up more
@@ -123,12 +123,12 @@ impl TexelCodec {
     /// The one without error, which any brick can have.
     pub const EXACT: Self = Self::ALL[Self::ALL.len() - 1];
 
-    /// Those of [`CachePolicy::ErrorOnly`].
+    /// Those of [`TrialPolicy::ErrorOnly`].
     pub const ERROR_ONLY: [Self; Self::count_error_only()] = {
         let mut found = [Self::EXACT; Self::count_error_only()];
         let (mut i, mut next) = (0, 0);
         while i < TABLE.len() {
-            if matches!(TABLE[i].cache, CachePolicy::ErrorOnly(_)) {
+            if matches!(TABLE[i].trial, TrialPolicy::ErrorOnly(_)) {
                 found[next] = Self(i as u8);
                 next += 1;
             }
@@ -140,7 +140,7 @@ impl TexelCodec {
     const fn count_error_only() -> usize {
         let (mut i, mut count) = (0, 0);
         while i < TABLE.len() {
-            count += matches!(TABLE[i].cache, CachePolicy::ErrorOnly(_)) as usize;
+            count += matches!(TABLE[i].trial, TrialPolicy::ErrorOnly(_)) as usize;
             i += 1;
         }
         count
@@ -183,26 +183,26 @@ impl TexelCodec {
     }
 
     /// When adaptive builds try it, and what they keep of that.
-    pub fn cache_policy(self) -> CachePolicy {
-        self.row().cache
+    pub fn trial_policy(self) -> TrialPolicy {
+        self.row().trial
     }
 
     /// Whether its texels are kept once they are made.
     pub fn keeps_texels(self) -> bool {
-        matches!(self.cache_policy(), CachePolicy::Always | CachePolicy::OnDemand)
+        matches!(self.trial_policy(), TrialPolicy::Always | TrialPolicy::OnDemand)
     }
 
     /// Whether it is tried only on bricks for which the search would choose it.
     pub fn is_on_demand(self) -> bool {
-        matches!(self.cache_policy(), CachePolicy::OnDemand)
+        matches!(self.trial_policy(), TrialPolicy::OnDemand)
     }
 
     /// Some values as its texels give them back: `None` where it cannot hold one.
     ///
     /// # Panics
-    /// For a codec that is not of [`CachePolicy::ErrorOnly`].
+    /// For a codec that is not of [`TrialPolicy::ErrorOnly`].
     pub fn round(self, values: &Voxels) -> Option<Voxels> {
-        let CachePolicy::ErrorOnly(round) = self.cache_policy() else {
+        let TrialPolicy::ErrorOnly(round) = self.trial_policy() else {
             panic!("{} is tried with its encoder", self.name());
         };
         round(values)

@@ -207,7 +207,7 @@ impl Entry {
         let TrialResults { notes, texels } = &self.made;
         let count = self.places.len();
         let is_axis = |note: &Note| match trial {
-            Trial::Plain => true,
+            Trial::WithoutTexels => true,
             Trial::Texels(codec) => {
                 u8::try_from(note.word).is_ok_and(|axis| codec.codec().axes().contains(&axis))
             }

@@ -5,6 +5,7 @@ use std::path::Path;
 use super::{Job, Made, VerifyLevel};
 use crate::cache::{Blob, Cache, Key, Namespace};
 use crate::cancel::CancelToken;
+use crate::codec::TexelCodec;
 use crate::digest::digest;
 use crate::error::{Error, Result};
 use crate::file_stamp::Stamp;
@@ -57,10 +58,11 @@ pub(super) enum Reused {
 }
 
 impl<'a> Reuse<'a> {
-    /// A pack's bytes depend on its provenance, and on nothing that is not in it.
+    /// A pack's bytes depend on its provenance, and on the codecs that an adaptive build can choose from.
     pub fn new(cache: &'a Cache, provenance: &Provenance) -> Self {
         let key = |stage, provenance: &Provenance| {
-            Key::new(stage, &provenance.to_json().expect("settings are finite numbers"))
+            let codecs = TexelCodec::ALL.map(TexelCodec::name);
+            Key::new(stage, &(provenance.to_json().expect("settings are finite numbers"), codecs))
         };
         Self {
             cache,

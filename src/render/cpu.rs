@@ -13,7 +13,7 @@ use super::scene::{AMBIENT, Scene, Setup, TraceError};
 use super::surface::{cubic, evaluate, first_change};
 use super::traverse::{Box3, Ray, Real, Walk};
 use super::{Mode, Traversal};
-use crate::volume::{BRICK_DIM, CELL_DIM, Coord, ROOT_DIM};
+use crate::volume::{BRICK_DIM, Coord, L1_DIM, L2_DIM};
 
 /// Steps after which a ray is given up: more than any box in view has cells across.
 const MAX_STEPS: u32 = 1 << 16;
@@ -365,7 +365,7 @@ impl<'a, F: Real> Tracer<'a, F> {
     /// Blue, red or cyan near a boundary of an L1, L2 or L3 node on the face that was hit; else grey.
     fn node_color(&self, ray: &Ray<F>, hit: &Hit<F>) -> [f32; 3] {
         // Nodes lie on multiples of their side counted from voxel 0.
-        let zero = self.setup.base.map(|b| -(b & (ROOT_DIM - 1)));
+        let zero = self.setup.base.map(|b| -(b & (L1_DIM - 1)));
         let p = self.local(ray, zero, hit.t);
         for (dim, width, color) in NODE_COLORS {
             let near = (0..3).filter(|&a| a != hit.axis).any(|a| {
@@ -385,7 +385,7 @@ impl<'a, F: Real> Tracer<'a, F> {
 
 /// Side, half width of the line in cells, and colour of what is drawn around nodes.
 const NODE_COLORS: [(i32, f64, [f32; 3]); 3] =
-    [(ROOT_DIM, 1.0, [0.1, 0.2, 1.0]), (CELL_DIM, 0.75, [1.0, 0.15, 0.1]), (BRICK_DIM, 0.5, [0.0, 0.9, 0.9])];
+    [(L1_DIM, 1.0, [0.1, 0.2, 1.0]), (L2_DIM, 0.75, [1.0, 0.15, 0.1]), (BRICK_DIM, 0.5, [0.0, 0.9, 0.9])];
 
 /// The combinations of the four bits of a perturbation.
 const PERTURBATIONS: u32 = 16;

@@ -8,7 +8,7 @@ use crate::codec::Codec;
 use crate::pack::{FrameReader, PackError, Region};
 use crate::vdb::{Internal, Scalar, Tree};
 use crate::volume::{
-    BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, CoordBox, Mask512, NODE_CHILDREN, ROOT_DIM,
+    BRICK_DIM, BRICK_VOXELS, Constant, Coord, CoordBox, L1_DIM, L2_DIM, Mask512, NODE_CHILDREN,
 };
 
 /// A frame as nested constants and bricks of values.
@@ -146,7 +146,7 @@ impl DecodedFrame {
             }
         }
         let levels: [(&[Internal<T>], u32, i32, PutConstant); 2] =
-            [(&tree.l1, 5, CELL_DIM, Self::put_cell), (&tree.l2, 4, BRICK_DIM, Self::put_region)];
+            [(&tree.l1, 5, L2_DIM, Self::put_cell), (&tree.l2, 4, BRICK_DIM, Self::put_region)];
         for (nodes, log2, dim, put) in levels {
             for node in nodes {
                 for i in node.tile_indices() {
@@ -177,7 +177,7 @@ impl DecodedFrame {
         let mut result = Ok(());
         frame.for_each_region(|origin, dim, region| match region {
             Region::Background => {}
-            Region::Constant(constant) if dim == ROOT_DIM => field.put_root(origin, constant),
+            Region::Constant(constant) if dim == L1_DIM => field.put_root(origin, constant),
             Region::Constant(constant) => field.put_cell(origin, constant),
             Region::Brick(record) if record.codec == Codec::Constant && record.mask.is_none() => {
                 let value = f32::from_bits(record.word2);
@@ -196,12 +196,12 @@ impl DecodedFrame {
     }
 
     fn put_root(&mut self, origin: Coord, constant: Constant) {
-        self.bounds.union(CoordBox::cube(origin, ROOT_DIM));
+        self.bounds.union(CoordBox::cube(origin, L1_DIM));
         self.roots.insert(origin, constant);
     }
 
     fn put_cell(&mut self, origin: Coord, constant: Constant) {
-        self.bounds.union(CoordBox::cube(origin, CELL_DIM));
+        self.bounds.union(CoordBox::cube(origin, L2_DIM));
         self.cells.insert(origin, Cell::Constant(constant));
     }
 
@@ -209,7 +209,7 @@ impl DecodedFrame {
         self.bounds.union(CoordBox::cube(origin, BRICK_DIM));
         let cell = self
             .cells
-            .entry(origin.align_down(CELL_DIM))
+            .entry(origin.align_down(L2_DIM))
             .or_insert_with(|| Cell::Node(Box::new([0; NODE_CHILDREN]), Vec::new()));
         let Cell::Node(places, constants) = cell else { unreachable!("a cell is constant or a node") };
         (&mut places[origin.child_index(4, BRICK_DIM)], constants)
@@ -231,12 +231,12 @@ impl DecodedFrame {
     pub fn find(&self, at: Coord) -> Found<'_> {
         let found = |content, dim: i32| Found { content, origin: at.align_down(dim), dim };
         let background = Content::Constant(Constant { value: self.background, active: false });
-        match self.cells.get(&at.align_down(CELL_DIM)) {
-            None => match self.roots.get(&at.align_down(ROOT_DIM)) {
-                Some(root) => found(Content::Constant(*root), ROOT_DIM),
-                None => found(background, CELL_DIM),
+        match self.cells.get(&at.align_down(L2_DIM)) {
+            None => match self.roots.get(&at.align_down(L1_DIM)) {
+                Some(root) => found(Content::Constant(*root), L1_DIM),
+                None => found(background, L2_DIM),
             },
-            Some(Cell::Constant(c)) => found(Content::Constant(*c), CELL_DIM),
+            Some(Cell::Constant(c)) => found(Content::Constant(*c), L2_DIM),
             Some(Cell::Node(places, constants)) => {
                 let content = match places[at.child_index(4, BRICK_DIM)] {
                     0 => background,
@@ -251,9 +251,9 @@ impl DecodedFrame {
     /// Whether the region of a voxel and the seven next to it on its high sides are background, all of
     /// them in one L2 node: then no cell of that region has a corner that is not.
     pub fn is_alone(&self, at: Coord) -> bool {
-        let region = |axis: usize| at.0[axis].rem_euclid(CELL_DIM) / BRICK_DIM;
-        let Some(Cell::Node(places, _)) = self.cells.get(&at.align_down(CELL_DIM)) else { return false };
-        let last = CELL_DIM / BRICK_DIM - 1;
+        let region = |axis: usize| at.0[axis].rem_euclid(L2_DIM) / BRICK_DIM;
+        let Some(Cell::Node(places, _)) = self.cells.get(&at.align_down(L2_DIM)) else { return false };
+        let last = L2_DIM / BRICK_DIM - 1;
         (0..3).all(|axis| region(axis) < last)
             && (0..8).all(|corner| {
                 let side = |axis: usize| BRICK_DIM * (corner >> axis & 1);

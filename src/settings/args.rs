@@ -49,7 +49,7 @@ pub struct SettingsArgs {
     /// Seed of the first centroids [default: 0]
     #[arg(long, help_heading = "k-means")]
     pub seed: Option<u64>,
-    /// Value range that unorm8, bc4 and bc7 texels are normalised to [default: brick]
+    /// Value range that 0 to 1 of normalised texels (unorm and BC) stand for [default: brick]
     #[arg(short, long, help_heading = "Quality")]
     pub range: Option<RangeMode>,
     /// Which bricks keep their active masks [default: auto]

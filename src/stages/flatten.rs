@@ -7,7 +7,7 @@ use crate::error::{Error, Result};
 use crate::settings::NonFinite;
 use crate::vdb::{GridInfo, LEAVES_IN_BLOCK, Scalar, Tree, VdbFile, with_scalar_type};
 use crate::volume::{
-    BRICK_VOXELS, Brick, CELL_DIM, Cell, CellContent, Child, Constant, Coord, FlatFrame, FrameStats, Mask512,
+    BRICK_VOXELS, Brick, Cell, CellContent, Child, Constant, Coord, FlatFrame, FrameStats, L2_DIM, Mask512,
     ValueRange,
 };
 
@@ -131,7 +131,7 @@ fn flatten_tree<T: Scalar>(mut tree: Tree<T>, reading: Reading) -> Flattened {
             } else {
                 f.tile(l1.tiles[i], l1.is_active(i)).map(CellContent::Constant)
             };
-            let origin = l1.origin.offset_by(Coord::child_offset(i, 5, CELL_DIM));
+            let origin = l1.origin.offset_by(Coord::child_offset(i, 5, L2_DIM));
             cells.extend(content.map(|content| Cell { origin, content }));
         }
     }

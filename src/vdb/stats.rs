@@ -4,7 +4,7 @@ use rayon::prelude::*;
 
 use super::tree::Tree;
 use super::value::{Scalar, Value};
-use crate::volume::{BRICK_DIM, CELL_DIM, Coord, CoordBox, Mask512, ROOT_DIM};
+use crate::volume::{BRICK_DIM, Coord, CoordBox, L1_DIM, L2_DIM, Mask512};
 
 /// What the masks of a tree say.
 #[derive(Clone, Debug, PartialEq)]
@@ -46,8 +46,8 @@ const fn volume(dim: i32) -> u64 {
 impl<T: Value> Tree<T> {
     /// The active tiles of every level: value, origin, and voxels along an axis.
     pub fn active_tiles(&self) -> impl Iterator<Item = (T, Coord, i32)> + '_ {
-        let root = self.tiles.iter().filter(|t| t.active).map(|t| (t.value, t.origin, ROOT_DIM));
-        let inner = [(&self.l1, 5, CELL_DIM), (&self.l2, 4, BRICK_DIM)];
+        let root = self.tiles.iter().filter(|t| t.active).map(|t| (t.value, t.origin, L1_DIM));
+        let inner = [(&self.l1, 5, L2_DIM), (&self.l2, 4, BRICK_DIM)];
         root.chain(inner.into_iter().flat_map(|(nodes, log2, dim)| {
             nodes.iter().flat_map(move |node| {
                 crate::volume::bits(&node.active).map(move |i| {
@@ -63,8 +63,8 @@ impl<T: Value> Tree<T> {
         let mut tiles = [0u64; 3];
         for (_, origin, dim) in self.active_tiles() {
             tiles[match dim {
-                ROOT_DIM => 0,
-                CELL_DIM => 1,
+                L1_DIM => 0,
+                L2_DIM => 1,
                 _ => 2,
             }] += 1;
             bbox.union(CoordBox::cube(origin, dim));
@@ -79,8 +79,8 @@ impl<T: Value> Tree<T> {
             leaves: self.leaves.len() as u64,
             active_leaf_voxels,
             active_voxels: active_leaf_voxels
-                + root_tiles * volume(ROOT_DIM)
-                + l1_tiles * volume(CELL_DIM)
+                + root_tiles * volume(L1_DIM)
+                + l1_tiles * volume(L2_DIM)
                 + l2_tiles * volume(BRICK_DIM),
             root_tiles,
             l1_tiles,

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::ops::Range;
 
-use crate::volume::{BRICK_DIM, BRICK_VOXELS, CELL_DIM, Coord, Mask512, ROOT_DIM};
+use crate::volume::{BRICK_DIM, BRICK_VOXELS, Coord, L1_DIM, L2_DIM, Mask512};
 
 /// One grid's voxels and tiles.
 ///
@@ -190,14 +190,14 @@ impl<'a, T: Copy> Accessor<'a, T> {
 
     fn find(&self, at: Coord) -> Found<T> {
         let tree = self.tree;
-        let l1 = match self.roots.get(&at.align_down(ROOT_DIM)) {
-            None => return Found::tile(tree.background, false, ROOT_DIM),
-            Some(&Root::Tile(i)) => return Found::tile(tree.tiles[i].value, tree.tiles[i].active, ROOT_DIM),
+        let l1 = match self.roots.get(&at.align_down(L1_DIM)) {
+            None => return Found::tile(tree.background, false, L1_DIM),
+            Some(&Root::Tile(i)) => return Found::tile(tree.tiles[i].value, tree.tiles[i].active, L1_DIM),
             Some(&Root::Node(i)) => &tree.l1[i],
         };
-        let index = at.child_index(5, CELL_DIM);
+        let index = at.child_index(5, L2_DIM);
         if !l1.is_child(index) {
-            return Found::tile(l1.tiles[index], l1.is_active(index), CELL_DIM);
+            return Found::tile(l1.tiles[index], l1.is_active(index), L2_DIM);
         }
         let l2 = &tree.l2[l1.first_child + l1.rank(index)];
         let index = at.child_index(4, BRICK_DIM);

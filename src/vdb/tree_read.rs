@@ -10,7 +10,7 @@ use super::grid::GridInfo;
 use super::tree::{Internal, LEAVES_IN_BLOCK, Leaves, RootTile, Tree};
 use super::value::{Value, ValueType};
 use super::{Result, VdbError};
-use crate::volume::{BRICK_DIM, BRICK_VOXELS, CELL_DIM, Coord, Mask512, ROOT_DIM, bits};
+use crate::volume::{BRICK_DIM, BRICK_VOXELS, Coord, L1_DIM, L2_DIM, Mask512, bits};
 
 /// Reads the background of the tree whose first byte is at the cursor.
 pub(super) fn read_background<T: Value>(c: &mut Cursor) -> Result<T> {
@@ -61,10 +61,10 @@ fn root_origin(c: &mut Cursor, seen: &mut HashSet<Coord>) -> Result<Coord> {
     for v in &mut origin.0 {
         *v = c.i32("a root entry's origin")?;
     }
-    if !origin.is_aligned(ROOT_DIM) {
+    if !origin.is_aligned(L1_DIM) {
         return Err(VdbError::corrupt(
             at,
-            format!("root entry at {:?}, not a multiple of {ROOT_DIM}", origin.0),
+            format!("root entry at {:?}, not a multiple of {L1_DIM}", origin.0),
         ));
     }
     if !seen.insert(origin) {
@@ -82,7 +82,7 @@ impl<T: Value> Reader<T> {
     fn l1_node(&mut self, c: &mut Cursor, origin: Coord, tree: &mut Tree<T>) -> Result<()> {
         let node = self.internal(c, origin, 5, tree.l2.len())?;
         for i in bits(&node.children) {
-            let origin = origin.offset_by(Coord::child_offset(i, 5, CELL_DIM));
+            let origin = origin.offset_by(Coord::child_offset(i, 5, L2_DIM));
             let l2 = self.internal(c, origin, 4, tree.leaves.len())?;
             for i in bits(&l2.children) {
                 tree.leaves.masks.push(Mask512::from_bytes(c.array("a leaf's mask")?));

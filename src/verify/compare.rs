@@ -10,7 +10,7 @@ use crate::pack::{FrameReader, Region};
 use crate::settings::Masks;
 use crate::vdb::{Accessor, GridInfo, Internal, Scalar, Tree};
 use crate::volume::{
-    BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, InactiveRule, Mask512, ROOT_DIM, ValueRange,
+    BRICK_DIM, BRICK_VOXELS, Constant, Coord, InactiveRule, L1_DIM, L2_DIM, Mask512, ValueRange,
 };
 
 /// Compares a frame of a pack with the tree that it was made from.
@@ -69,10 +69,10 @@ impl<T: Scalar> Comparison<'_, T> {
     /// Every tile of the source but inactive background must be there exactly.
     fn check_tiles(&self, error: &mut FrameError) {
         for tile in &self.tree.tiles {
-            self.check_tile(tile.origin, ROOT_DIM, tile.value, tile.active, error);
+            self.check_tile(tile.origin, L1_DIM, tile.value, tile.active, error);
         }
         let levels: [(&[Internal<T>], u32, i32); 2] =
-            [(&self.tree.l1, 5, CELL_DIM), (&self.tree.l2, 4, BRICK_DIM)];
+            [(&self.tree.l1, 5, L2_DIM), (&self.tree.l2, 4, BRICK_DIM)];
         for (nodes, log2, dim) in levels {
             for node in nodes {
                 for i in node.tile_indices() {
@@ -192,8 +192,8 @@ impl<T: Scalar> Comparison<'_, T> {
             codec => match codec.fidelity() {
                 Fidelity::Exact => Bound::Exact,
                 Fidelity::NearestHalf => Bound::Half,
-                // Half a step of 255.
-                Fidelity::NearestStep => Bound::Within(extent / 510.0 + slack),
+                // Half a step.
+                Fidelity::NearestStep { steps } => Bound::Within(extent / f64::from(2 * steps) + slack),
                 Fidelity::InRange => Bound::Within(extent + slack),
             },
         };

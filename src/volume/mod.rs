@@ -16,6 +16,6 @@ pub use pool::{BRICKS_IN_FLIGHT, BrickPool, Interner};
 pub use scratch::{SCRATCH_SMALL, Scratch, ScratchError, ScratchFolder, ScratchResult};
 pub use sorted_map::SortedMap;
 pub use volpack_format::{
-    BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, CoordBox, InactiveRule, Mask512, NODE_CHILDREN,
-    ROOT_DIM, ValueRange, bits,
+    BRICK_DIM, BRICK_VOXELS, Constant, Coord, CoordBox, InactiveRule, L1_DIM, L2_DIM, Mask512, NODE_CHILDREN,
+    ValueRange, bits,
 };

@@ -11,7 +11,7 @@ use crate::tree::{
     self, GRID_WORDS, HEADER_WORDS, L3Record, Link, MASK_WORDS, NODE_FIRST_RECORD, NODE_MASK_WORDS,
     NODE_WORDS, RECORD_WORDS, grid, header, l1_words,
 };
-use crate::{Atlas, CELL_DIM, Coord, Grid, InactiveRule, PackError};
+use crate::{Atlas, Coord, Grid, InactiveRule, L2_DIM, PackError};
 
 /// So many entries of a table from the first on.
 pub(crate) fn range(first: u32, count: u32) -> Range<usize> {
@@ -145,13 +145,12 @@ pub(crate) fn grid(words: &[u32], index: usize, record: GridRecord, name: &str) 
     ensure(active_min.is_finite() && active_max.is_finite() && active_min <= active_max, || {
         format!("grid {name:?} has an impossible range of active values")
     })?;
-    let is_sound = grid.origin.is_aligned(CELL_DIM)
+    let is_sound = grid.origin.is_aligned(L2_DIM)
         && grid.cells.iter().all(|c| (1..=32).contains(c))
         && grid.roots.iter().all(|r| *r >= 1)
         && (grid.roots == [1; 3] || grid.has_whole_roots());
     let end = |a: usize| {
-        i64::from(grid.origin.0[a])
-            + i64::from(grid.cells[a]) * i64::from(grid.roots[a]) * i64::from(CELL_DIM)
+        i64::from(grid.origin.0[a]) + i64::from(grid.cells[a]) * i64::from(grid.roots[a]) * i64::from(L2_DIM)
     };
     // Unsound cells could make the product wrap.
     ensure(is_sound && (0..3).all(|a| end(a) <= i64::from(i32::MAX) + 1), || {

@@ -4,11 +4,11 @@
 pub const BRICK_DIM: i32 = 8;
 /// Voxels along one axis of an L2 node: 16 bricks. Also the grid that origins and boxes snap to, so
 /// that node boundaries agree between the frames of a sequence.
-pub const CELL_DIM: i32 = 128;
+pub const L2_DIM: i32 = 128;
 /// Bricks that an L2 node has places for.
-pub const NODE_CHILDREN: usize = ((CELL_DIM / BRICK_DIM) as usize).pow(3);
+pub const NODE_CHILDREN: usize = ((L2_DIM / BRICK_DIM) as usize).pow(3);
 /// Voxels along one axis of an OpenVDB root entry and of a full L1 node: 32 L2 nodes.
-pub const ROOT_DIM: i32 = 4096;
+pub const L1_DIM: i32 = 4096;
 
 /// A voxel's integer position in OpenVDB index space.
 ///
@@ -110,8 +110,8 @@ mod tests {
 
     #[test]
     fn child_index_inverts_child_offset() {
-        for (log2, dim) in [(3, 1), (4, BRICK_DIM), (5, CELL_DIM)] {
-            let node = Coord::new(-ROOT_DIM, 0, 2 * ROOT_DIM);
+        for (log2, dim) in [(3, 1), (4, BRICK_DIM), (5, L2_DIM)] {
+            let node = Coord::new(-L1_DIM, 0, 2 * L1_DIM);
             for index in [0, 1, 7, 63, (1usize << (3 * log2)) - 1] {
                 let at = node.offset_by(Coord::child_offset(index, log2, dim));
                 assert_eq!(at.child_index(log2, dim), index);

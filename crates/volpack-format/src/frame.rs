@@ -11,8 +11,8 @@ use crate::tree::{
     l1_words,
 };
 use crate::{
-    Atlas, BRICK_DIM, BRICK_VOXELS, CELL_DIM, Constant, Coord, CoordBox, Frame, Grid, InactiveRule, Mask512,
-    Pack, PackError, ROOT_DIM, check,
+    Atlas, BRICK_DIM, BRICK_VOXELS, Constant, Coord, CoordBox, Frame, Grid, InactiveRule, L1_DIM, L2_DIM,
+    Mask512, Pack, PackError, check,
 };
 
 /// The deepest thing that the tree has at some place.
@@ -138,7 +138,7 @@ impl FrameReader<'_> {
         for a in 0..3 {
             let offset = i64::from(at.0[a]) - i64::from(grid.origin.0[a]);
             let (cells, roots) = (i64::from(grid.cells[a]), i64::from(grid.roots[a]));
-            let index = offset.div_euclid(CELL_DIM.into());
+            let index = offset.div_euclid(L2_DIM.into());
             if index < 0 || index >= cells * roots {
                 return (Region::Background, self.outside_dim(at));
             }
@@ -147,17 +147,17 @@ impl FrameReader<'_> {
         }
         let words = self.words();
         let l1 = match Link::from_word(words[grid.root_at + self.frame * grid.root_count() + root]) {
-            Link::Node(0) => return (Region::Background, ROOT_DIM),
+            Link::Node(0) => return (Region::Background, L1_DIM),
             Link::Constant { index, active } => {
-                return (Region::Constant(self.constant(index, active)), ROOT_DIM);
+                return (Region::Constant(self.constant(index, active)), L1_DIM);
             }
             Link::Node(l1) => l1 as usize,
         };
         let (mask_words, rank_words) = l1_words(grid.cell_count());
         let (mask, rest) = words[l1..].split_at(mask_words);
-        let Some(rank) = tree::rank(mask, rest, cell) else { return (Region::Background, CELL_DIM) };
+        let Some(rank) = tree::rank(mask, rest, cell) else { return (Region::Background, L2_DIM) };
         match Link::from_word(rest[rank_words + rank as usize]) {
-            Link::Constant { index, active } => (Region::Constant(self.constant(index, active)), CELL_DIM),
+            Link::Constant { index, active } => (Region::Constant(self.constant(index, active)), L2_DIM),
             Link::Node(node) => (self.child(node, at.child_index(4, BRICK_DIM)), BRICK_DIM),
         }
     }
@@ -165,14 +165,14 @@ impl FrameReader<'_> {
     /// The side of an aligned cube around a voxel outside the grid's box that is all outside.
     fn outside_dim(&self, at: Coord) -> i32 {
         let grid = self.grid();
-        let root = at.align_down(ROOT_DIM);
+        let root = at.align_down(L1_DIM);
         let is_apart = |a: usize| {
             let [origin, root] = [grid.origin, root].map(|corner| i64::from(corner.0[a]));
-            let extent = i64::from(grid.cells[a]) * i64::from(grid.roots[a]) * i64::from(CELL_DIM);
-            root + i64::from(ROOT_DIM) <= origin || origin + extent <= root
+            let extent = i64::from(grid.cells[a]) * i64::from(grid.roots[a]) * i64::from(L2_DIM);
+            root + i64::from(L1_DIM) <= origin || origin + extent <= root
         };
         // The box is made of whole cells.
-        if (0..3).any(is_apart) { ROOT_DIM } else { CELL_DIM }
+        if (0..3).any(is_apart) { L1_DIM } else { L2_DIM }
     }
 
     fn child(&self, node: u32, index: usize) -> Region {
@@ -209,12 +209,12 @@ impl FrameReader<'_> {
         let root_count = grid.root_count();
         for (i, root) in roots.enumerate() {
             // A box from one end of i32 to the other has offsets past its range, but no corners.
-            let corner = |a: usize| i64::from(grid.origin.0[a]) + i64::from(root[a]) * i64::from(ROOT_DIM);
+            let corner = |a: usize| i64::from(grid.origin.0[a]) + i64::from(root[a]) * i64::from(L1_DIM);
             let origin = Coord(std::array::from_fn(|a| corner(a) as i32));
             let l1 = match Link::from_word(words[grid.root_at + self.frame * root_count + i]) {
                 Link::Node(0) => continue,
                 Link::Constant { index, active } => {
-                    visit(origin, ROOT_DIM, Region::Constant(self.constant(index, active)));
+                    visit(origin, L1_DIM, Region::Constant(self.constant(index, active)));
                     continue;
                 }
                 Link::Node(l1) => l1 as usize,
@@ -225,10 +225,10 @@ impl FrameReader<'_> {
             for (&link, cell) in links.iter().zip(cells) {
                 let cell = cell as i32;
                 let cell = [cell / (cy * cz), cell / cz % cy, cell % cz];
-                let origin = origin.offset_by(cell.map(|c| c * CELL_DIM));
+                let origin = origin.offset_by(cell.map(|c| c * L2_DIM));
                 match Link::from_word(link) {
                     Link::Constant { index, active } => {
-                        visit(origin, CELL_DIM, Region::Constant(self.constant(index, active)));
+                        visit(origin, L2_DIM, Region::Constant(self.constant(index, active)));
                     }
                     Link::Node(node) => self.for_each_child(node, origin, &mut visit),
                 }

@@ -4,7 +4,7 @@ use std::ops::Range;
 
 use crate::codec::SequenceRange;
 use crate::layout::{FrameRecord, GridRecord};
-use crate::{Coord, GridClass, ROOT_DIM, ValueRange, voxel_size};
+use crate::{Coord, GridClass, L1_DIM, ValueRange, voxel_size};
 
 /// One grid of a pack.
 #[derive(Clone, Debug)]
@@ -46,7 +46,7 @@ impl Grid {
 
     /// Whether each of its L1 nodes covers a cube that OpenVDB has a root entry for, so that one value may stand for it.
     pub(crate) fn has_whole_roots(&self) -> bool {
-        self.cells == [32; 3] && self.origin.is_aligned(ROOT_DIM)
+        self.cells == [32; 3] && self.origin.is_aligned(L1_DIM)
     }
 
     /// L1 nodes of a frame.

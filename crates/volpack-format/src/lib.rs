@@ -55,7 +55,7 @@ mod zstd;
 
 pub use atlas::{Atlas, MAX_TEXELS};
 pub use codec::Codec;
-pub use coord::{BRICK_DIM, CELL_DIM, Coord, CoordBox, NODE_CHILDREN, ROOT_DIM};
+pub use coord::{BRICK_DIM, Coord, CoordBox, L1_DIM, L2_DIM, NODE_CHILDREN};
 pub use error::PackError;
 pub use frame::{DecodedBrick, FrameReader, Region};
 pub use grid::{Frame, Grid};

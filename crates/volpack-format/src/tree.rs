@@ -11,7 +11,7 @@ pub const HEADER_WORDS: usize = 32;
 pub const GRID_WORDS: usize = 16;
 /// Words of an L2 node's mask, a bit a child.
 pub const NODE_MASK_WORDS: usize = NODE_CHILDREN / 32;
-/// The word of an L2 node that has its first record; between it and the mask lie 16-bit ranks, one a word of the mask.
+/// The place of the first record's number in an L2 node, after the mask and its 16-bit ranks, one a word of the mask.
 pub const NODE_FIRST_RECORD: usize = NODE_MASK_WORDS + NODE_MASK_WORDS / 2;
 /// Words of an L2 node.
 pub const NODE_WORDS: usize = NODE_FIRST_RECORD + 1;
@@ -36,10 +36,16 @@ pub mod header {
     pub const CONSTANTS: usize = 10;
 
     /// The place of a codec's atlas geometry: columns, rows, slabs a page.
-    pub fn atlas(codec: crate::codec::Codec) -> usize {
+    pub const fn atlas(codec: crate::codec::Codec) -> usize {
         12 + 4 * (codec as usize - 1)
     }
 }
+
+// The header has room for every codec, and a record's three bits for its tag.
+const _: () = {
+    assert!(Codec::COUNT <= 8);
+    assert!(header::atlas(Codec::WITH_TEXELS[Codec::WITH_TEXELS.len() - 1]) + 4 <= HEADER_WORDS);
+};
 
 /// Places of words in a grid's header.
 #[allow(missing_docs)] // docs/format.md names each.

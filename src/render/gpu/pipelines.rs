@@ -173,10 +173,14 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_shader_knows_which_codecs_are_normalised() {
+    fn the_shader_knows_the_codecs() {
         let normalised = Codec::WITH_TEXELS.into_iter().filter(|codec| codec.is_normalised());
-        let bits: u32 = normalised.map(|codec| 1 << codec as u32).sum();
-        let line = format!("const VP_NORMALISED = {bits}u;");
-        assert!(VOLPACK_WGSL.contains(&line), "volpack.wgsl should have `{line}`");
+        let normalised: u32 = normalised.map(|codec| 1 << codec as u32).sum();
+        let all = (1u32 << Codec::COUNT) - 1;
+        for line in
+            [format!("const VP_NORMALISED = {normalised}u;"), format!("override VP_CODECS: u32 = {all}u;")]
+        {
+            assert!(VOLPACK_WGSL.contains(&line), "volpack.wgsl should have `{line}`");
+        }
     }
 }

@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 use crate::pods;
 use crate::stages::flatten::Flattened;
 use crate::volume::{
-    Brick, BrickPool, CELL_DIM, Cell, CellContent, Child, ChunkedVec, Constant, Coord, FlatFrame, FrameStats,
-    InactiveRule, Mask512, NODE_CHILDREN, ROOT_DIM, ValueRange,
+    Brick, BrickPool, Cell, CellContent, Child, ChunkedVec, Constant, Coord, FlatFrame, FrameStats,
+    InactiveRule, L1_DIM, L2_DIM, Mask512, NODE_CHILDREN, ValueRange,
 };
 
 /// Whether bricks keep their active masks.
@@ -111,8 +111,8 @@ impl FrameIndex {
         }) && next as usize == self.bricks.len()
             && self.bricks.iter().all(|brick| brick.is_sound(self.sign_mask.len()))
             && self.cells.is_sorted_by(|a, b| a.origin < b.origin)
-            && self.cells.iter().all(|cell| cell.origin.is_aligned(CELL_DIM))
-            && self.roots.iter().all(|(origin, _)| origin.is_aligned(ROOT_DIM))
+            && self.cells.iter().all(|cell| cell.origin.is_aligned(L2_DIM))
+            && self.roots.iter().all(|(origin, _)| origin.is_aligned(L1_DIM))
             && self.roots.is_sorted_by(|a, b| a.0 < b.0)
     }
 

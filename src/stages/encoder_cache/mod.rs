@@ -26,7 +26,7 @@ pub use batch::{BATCH_BRICKS, Batch};
 use batch::{batches, batches_of};
 pub use measure::Measure;
 pub use memo::Memo;
-pub use trial::{ConstantAim, Cost, Note, Plain, Trial, TrialResults};
+pub use trial::{ConstantAim, Cost, Note, Trial, TrialResults, WithoutTexels};
 
 /// What the error of a grid's bricks depends on beside the bricks.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
@@ -153,9 +153,9 @@ impl EncoderCache {
     ///
     /// # Errors
     /// When the scratch file cannot be read back.
-    pub fn plain(&self, ids: &[u32]) -> ScratchResult<Vec<Plain>> {
-        let notes = self.memo.notes(Trial::Plain, ids)?;
-        Ok(notes.as_chunks().0.iter().copied().map(Plain::from_notes).collect())
+    pub fn plain(&self, ids: &[u32]) -> ScratchResult<Vec<WithoutTexels>> {
+        let notes = self.memo.notes(Trial::WithoutTexels, ids)?;
+        Ok(notes.as_chunks().0.iter().copied().map(WithoutTexels::from_notes).collect())
     }
 
     /// What a codec does to some bricks that it was tried on.
@@ -257,16 +257,22 @@ impl EncoderCache {
         let texels: Vec<Texels> = ids.iter().zip(bricks).map(|(&id, b)| self.prepare(tree, id, b)).collect();
         let each = || ids.iter().zip(bricks).zip(&texels);
         let made = |trial: &Trial| match *trial {
-            Trial::Plain => {
-                let plain = each().map(|((&id, b), t)| self.make_plain(tree, id, b, t));
-                TrialResults { notes: plain.flat_map(Plain::to_notes).collect(), texels: Vec::new() }
+            Trial::WithoutTexels => {
+                let plain = each().map(|((&id, b), t)| self.make_without_texels(tree, id, b, t));
+                TrialResults { notes: plain.flat_map(WithoutTexels::to_notes).collect(), texels: Vec::new() }
             }
             Trial::Texels(codec) => self.make_texels(codec, bricks, &texels),
         };
         Ok(trials.iter().map(made).collect())
     }
 
-    fn make_plain(&self, tree: &SequenceTree, id: u32, brick: &Brick, texels: &Texels) -> Plain {
+    fn make_without_texels(
+        &self,
+        tree: &SequenceTree,
+        id: u32,
+        brick: &Brick,
+        texels: &Texels,
+    ) -> WithoutTexels {
         let range = tree.brick_ranges[id];
         let value = match self.terms.aim {
             ConstantAim::Squares => measure::mean(brick, &texels.texel_mask),
@@ -282,7 +288,7 @@ impl EncoderCache {
             true => Cost::IMPOSSIBLE,
             false => measure.of(&[tree.background; BRICK_VOXELS], None),
         };
-        Plain { value, constant: measure.of(&[value; BRICK_VOXELS], None), empty, error_only }
+        WithoutTexels { value, constant: measure.of(&[value; BRICK_VOXELS], None), empty, error_only }
     }
 
     fn make_texels(&self, codec: TexelCodec, bricks: &[Brick], texels: &[Texels]) -> TrialResults {

@@ -37,7 +37,7 @@ pub enum ConstantAim {
 
 /// A brick without texels, or with raw ones: what can be said of it without keeping a byte.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Plain {
+pub struct WithoutTexels {
     /// What it would be as a constant.
     pub value: f32,
     /// As that constant.
@@ -48,7 +48,7 @@ pub struct Plain {
     pub error_only: [Cost; TexelCodec::ERROR_ONLY.len()],
 }
 
-impl Plain {
+impl WithoutTexels {
     pub(super) const NOTES: usize = 2 + TexelCodec::ERROR_ONLY.len();
 
     pub(super) fn to_notes(self) -> impl Iterator<Item = Note> {
@@ -69,8 +69,8 @@ impl Plain {
 /// What a brick is tried as.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub enum Trial {
-    /// Without texels, or with texels that are not kept: [`Plain`].
-    Plain,
+    /// Without texels, or with texels that are not kept: [`WithoutTexels`].
+    WithoutTexels,
     /// With texels of a codec that [keeps them](TexelCodec::keeps_texels).
     Texels(TexelCodec),
 }
@@ -78,7 +78,7 @@ pub enum Trial {
 impl Trial {
     /// All of them.
     pub const ALL: [Self; 1 + TexelCodec::ALL.len()] = {
-        let mut all = [Self::Plain; 1 + TexelCodec::ALL.len()];
+        let mut all = [Self::WithoutTexels; 1 + TexelCodec::ALL.len()];
         let mut i = 0;
         while i < TexelCodec::ALL.len() {
             all[1 + i] = Self::Texels(TexelCodec::ALL[i]);
@@ -90,7 +90,7 @@ impl Trial {
     /// Its place among them.
     pub fn index(self) -> usize {
         match self {
-            Self::Plain => 0,
+            Self::WithoutTexels => 0,
             Self::Texels(codec) => 1 + codec.index(),
         }
     }
@@ -98,7 +98,7 @@ impl Trial {
     /// Notes that are kept of a brick.
     pub fn notes(self) -> usize {
         match self {
-            Self::Plain => Plain::NOTES,
+            Self::WithoutTexels => WithoutTexels::NOTES,
             Self::Texels(_) => 1,
         }
     }
@@ -106,7 +106,7 @@ impl Trial {
     /// Bytes of texels of a brick.
     pub fn texels(self) -> usize {
         match self {
-            Self::Plain => 0,
+            Self::WithoutTexels => 0,
             Self::Texels(codec) => codec.codec().layout().brick_bytes(),
         }
     }

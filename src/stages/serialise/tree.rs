@@ -13,7 +13,7 @@ use crate::stages::allocate::Coding;
 use crate::stages::dedup::{CellRef, FrameTree, Payload, SequenceTree};
 use crate::stages::quantise::EncodedGrid;
 use crate::stages::relayout::Placement;
-use crate::volume::{CELL_DIM, Constant, Coord, Interner, ROOT_DIM, ScratchError};
+use crate::volume::{Constant, Coord, Interner, L1_DIM, L2_DIM, ScratchError};
 
 /// L1 nodes that all frames of a grid may have room for: 64 MB of links. A box of 40 of them an axis is
 /// 160,000 voxels wide, for 240 frames; only stray voxels far from the rest need more.
@@ -33,8 +33,8 @@ impl CellBox {
         let mut min = [i64::MAX; 3];
         let mut max = [i64::MIN; 3];
         let frames = || tree.frames.iter();
-        let cells = frames().flat_map(|f| f.cells.iter().map(|(at, _)| (at, CELL_DIM)));
-        let roots = frames().flat_map(|f| f.roots.iter().map(|(at, _)| (at, ROOT_DIM)));
+        let cells = frames().flat_map(|f| f.cells.iter().map(|(at, _)| (at, L2_DIM)));
+        let roots = frames().flat_map(|f| f.roots.iter().map(|(at, _)| (at, L1_DIM)));
         for (at, dim) in cells.chain(roots) {
             for a in 0..3 {
                 min[a] = min[a].min(at.0[a].into());
@@ -44,7 +44,7 @@ impl CellBox {
         if min[0] > max[0] {
             return Ok(Self { origin: Coord::default(), cells: [1; 3], roots: [1; 3] });
         }
-        let (cell, root) = (i64::from(CELL_DIM), i64::from(ROOT_DIM));
+        let (cell, root) = (i64::from(L2_DIM), i64::from(L1_DIM));
         let one_node = (0..3).all(|a| max[a] - min[a] <= root);
         if !one_node {
             // Several L1 nodes lie where OpenVDB's root entries do, so that a constant root entry is
@@ -75,7 +75,7 @@ impl CellBox {
     /// Which L1 node holds a voxel, and which of its cells.
     fn index(&self, at: Coord) -> (usize, usize) {
         let cell: [u32; 3] = std::array::from_fn(|a| {
-            ((i64::from(at.0[a]) - i64::from(self.origin.0[a])) / i64::from(CELL_DIM)) as u32
+            ((i64::from(at.0[a]) - i64::from(self.origin.0[a])) / i64::from(L2_DIM)) as u32
         });
         let flat = |v: [u32; 3], dims: [u32; 3]| ((v[0] * dims[1] + v[1]) * dims[2] + v[2]) as usize;
         let root = std::array::from_fn(|a| cell[a] / self.cells[a]);

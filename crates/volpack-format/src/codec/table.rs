@@ -21,15 +21,15 @@ pub(super) struct Row {
     pub block_bytes: usize,
     /// Whether texels are fractions of the brick's range rather than values.
     pub is_normalised: bool,
-    /// Whether a brick's channels may run along any axis; else it has none, and its record says 2.
+    /// Whether each brick chooses its packing axis. Otherwise the record's axis is 2.
     pub has_axis: bool,
-    /// Bytes of the words whose bytes zstd sees gathered; 1 for none.
+    /// Word size of the byte shuffle before zstd; 1 for no shuffle.
     pub word_bytes: usize,
     pub texture: TextureFormat,
     pub fidelity: Fidelity,
     /// Fills in what a texture unit gives for the bytes of a brick with this packing axis.
     pub decode: fn(&[u8], u8, &mut Voxels),
-    /// Fills in how far a GPU's texture unit may be from that, where it may.
+    /// Fills in how far GPUs may differ from `decode`; none if they agree.
     pub spread: Option<fn(&[u8], &mut Voxels)>,
 }
 
@@ -55,8 +55,11 @@ pub enum Fidelity {
     Exact,
     /// The nearest half float.
     NearestHalf,
-    /// The nearest of 256 steps of the brick's range.
-    NearestStep,
+    /// The nearest of equal steps of the brick's range.
+    NearestStep {
+        /// Steps from its least value to its greatest.
+        steps: u32,
+    },
     /// To stay inside the brick's range: an error of a block format has no closer bound.
     InRange,
 }
@@ -115,7 +118,7 @@ pub(super) static TABLE: [Row; 6] = [
         has_axis: false,
         word_bytes: 1,
         texture: TextureFormat::R8Unorm,
-        fidelity: Fidelity::NearestStep,
+        fidelity: Fidelity::NearestStep { steps: 255 },
         decode: |bytes, _, out| plain::decode(bytes, |[byte]| f32::from(byte) / 255.0, out),
         spread: None,
     },

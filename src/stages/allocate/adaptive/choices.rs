@@ -273,7 +273,7 @@ impl OnDemand {
 /// What every brick is tried as before anything is chosen.
 pub(super) fn tried_at_once() -> Vec<Trial> {
     let codecs = TexelCodec::ALL.into_iter().filter(|codec| codec.keeps_texels() && !codec.is_on_demand());
-    [Trial::Plain].into_iter().chain(codecs.map(Trial::Texels)).collect()
+    [Trial::WithoutTexels].into_iter().chain(codecs.map(Trial::Texels)).collect()
 }
 
 /// What candidates do to some bricks, and [`Candidate::Constant`]'s values. What was not tried costs nothing, and texel

@@ -17,7 +17,7 @@ const CLOSEST: usize = 3;
 const COARSE: usize = BRICK_VOXELS / 8;
 
 /// A brick that could lend, with its texels as a GPU reads them, 0 to 1.
-pub(super) struct Lender {
+pub(super) struct ReferencedBrick {
     texels: Box<[f32; BRICK_VOXELS]>,
     mean: f64,
     /// Sum of squared differences from the mean.
@@ -32,7 +32,7 @@ pub(super) fn decoded(
     encoders: &EncoderCache,
     tree: &SequenceTree,
     referenced_bricks: &[(u32, TexelCodec)],
-) -> Result<Vec<Lender>> {
+) -> Result<Vec<ReferencedBrick>> {
     let mut places: [Vec<u32>; TexelCodec::ALL.len()] = Default::default();
     let mut tried = Vec::new();
     for &(id, codec) in referenced_bricks {
@@ -55,7 +55,7 @@ pub(super) fn decoded(
         let mut shape = [0.0; COARSE];
         coarse(&texels, mean, energy, &mut shape);
         let squares = sum(|i| f64::from(texels[i]).powi(2));
-        Lender { texels, mean, energy, squares, coarse: shape.map(|v| v * trust as f32) }
+        ReferencedBrick { texels, mean, energy, squares, coarse: shape.map(|v| v * trust as f32) }
     };
     Ok(referenced_bricks.par_iter().map(referenced).collect())
 }
@@ -94,12 +94,12 @@ fn coarse(values: &[f32; BRICK_VOXELS], mean: f64, energy: f64, out: &mut [f32])
 
 /// The referenced bricks of a comparison, and their shapes as they are first compared, a row each.
 pub(super) struct Codebook<'a> {
-    referenced_bricks: Vec<&'a Lender>,
+    referenced_bricks: Vec<&'a ReferencedBrick>,
     shapes: Array2<f32>,
 }
 
 impl<'a> Codebook<'a> {
-    pub fn new(referenced_bricks: Vec<&'a Lender>) -> Self {
+    pub fn new(referenced_bricks: Vec<&'a ReferencedBrick>) -> Self {
         let mut shapes = Array2::<f32>::zeros((referenced_bricks.len(), COARSE));
         for (referenced, mut row) in referenced_bricks.iter().zip(shapes.rows_mut()) {
             row.as_slice_mut().expect("rows are contiguous").copy_from_slice(&referenced.coarse);
@@ -159,7 +159,12 @@ fn closest(similar: impl Iterator<Item = f32>, may_lend: impl Fn(usize) -> bool)
 
 /// The range under which a referenced brick's texels come closest to a brick of this mean, as a line through them does; `None` if
 /// it runs the other way.
-fn borrow(sequence: &SequenceRange, brick: &Brick, mean: f64, referenced: &Lender) -> Option<BrickRange> {
+fn borrow(
+    sequence: &SequenceRange,
+    brick: &Brick,
+    mean: f64,
+    referenced: &ReferencedBrick,
+) -> Option<BrickRange> {
     let (values, texels) = (&brick.values, &referenced.texels);
     let product = sum(|i| (f64::from(values[i]) - mean) * (f64::from(texels[i]) - referenced.mean));
     let (lo, span) = (f64::from(sequence.lo), f64::from(sequence.span));

@@ -14,7 +14,7 @@ use std::ops::Range;
 
 use rayon::prelude::*;
 
-use super::codebook::{Codebook, Lender, decoded};
+use super::codebook::{Codebook, ReferencedBrick, decoded};
 use super::offers::{EarlierOffers, Offer, OfferInputs, Offers, TexelReference};
 use crate::cancel::CancelToken;
 use crate::codec::{BrickRange, Half, TexelCodec};
@@ -182,7 +182,7 @@ fn count(referenced_bricks: &[(u32, TexelCodec)], ids: &Range<u32>) -> usize {
 /// The referenced bricks of the batches that are being compared.
 #[derive(Default)]
 struct Near {
-    batches: BTreeMap<usize, Vec<Lender>>,
+    batches: BTreeMap<usize, Vec<ReferencedBrick>>,
 }
 
 impl Near {
@@ -206,7 +206,7 @@ impl Near {
     }
 
     /// The referenced bricks of some of the batches.
-    fn referenced_bricks(&self, around: &Range<usize>) -> Vec<&Lender> {
+    fn referenced_bricks(&self, around: &Range<usize>) -> Vec<&ReferencedBrick> {
         self.batches.range(around.clone()).flat_map(|(_, referenced_bricks)| referenced_bricks).collect()
     }
 }
