@@ -1,7 +1,7 @@
 //! Stage 5: how each brick is coded, and what its texels' 0 and 1 stand for.
 //!
-//! A uniform format gives every brick one codec ([`uniform`]), and may merge similar ones ([`clustered`]). The adaptive one
-//! gives each brick the codec that serves the whole best ([`adaptive`]).
+//! A uniform format gives every brick one codec ([`uniform`]), and may merge similar ones ([`clustered()`]). The adaptive one
+//! gives each brick the codec that serves the whole best ([`adaptive()`]).
 
 mod adaptive;
 mod clustered;
