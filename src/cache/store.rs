@@ -251,7 +251,7 @@ impl Store {
         file.as_file().sync_all()?;
         // Others may share the store.
         crate::atomic_file::make_readable(file.as_file())?;
-        file.persist(path).map(drop).map_err(|e| e.error)
+        Ok(crate::atomic_file::replace(file, &path)?)
     }
 }
 

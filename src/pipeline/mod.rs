@@ -127,7 +127,7 @@ fn build_cached(
     // A mapped file cannot be renamed everywhere.
     drop(pack);
     if verification.as_ref().is_none_or(|report| report.ok) {
-        finished.map_or(Ok(()), FinishedPack::persist).map_err(Error::io(&job.output))?;
+        finished.map_or(Ok(()), FinishedPack::persist)?;
     }
     let uses = cache.map(|cache| cache.take_uses()).unwrap_or_default();
     let seconds = clock.laps;
