@@ -333,6 +333,22 @@ fn a_slip_in_the_arguments_costs_no_file() {
     }
     assert_eq!(std::fs::read(at.join("b.vdb")).unwrap(), before);
 
+    // Nobody can tell what an output is that cannot be read. This one gives an I/O error, to root as well.
+    #[cfg(target_os = "linux")]
+    {
+        let (_, error) = failure(&volpack(at, &["build", "a.vdb", "-o", "/proc/self/mem"]));
+        assert!(error.contains("/proc/self/mem: the output exists and cannot be read, so it is"), "{error}");
+    }
+    #[cfg(windows)]
+    {
+        use std::os::windows::fs::OpenOptionsExt;
+        std::fs::write(at.join("open.volpack"), "").unwrap();
+        let open = std::fs::OpenOptions::new().read(true).share_mode(0).open(at.join("open.volpack"));
+        let (code, error) = failure(&volpack(at, &["build", "a.vdb", "-o", "open.volpack"]));
+        assert!(code == 1 && error.contains("open.volpack is open in another program"), "{code} {error}");
+        drop(open);
+    }
+
     // A pack that fails verification does not take the place of one that passed.
     stdout(&volpack(at, &["build", "a.vdb", "-o", "a.volpack", "--verify", "voxels"]));
     let good = std::fs::read(at.join("a.volpack")).unwrap();
