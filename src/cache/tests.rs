@@ -103,6 +103,27 @@ fn what_was_not_used_for_longest_goes_first() {
 }
 
 #[test]
+fn a_use_is_noted_where_the_last_note_is_old_and_only_there() {
+    let (folder, cache, key) = filled();
+    let set_times = |age: u64| {
+        let then = SystemTime::now() - Duration::from_secs(age);
+        for path in files(folder.path()) {
+            fs::File::options().append(true).open(path).unwrap().set_modified(then).unwrap();
+        }
+    };
+    let ages = || {
+        let entries = ["actions", "blobs"].map(|map| files(&folder.path().join(map)).pop().unwrap());
+        entries.map(|path| fs::metadata(path).unwrap().modified().unwrap().elapsed().unwrap_or_default())
+    };
+    set_times(2 * 3600);
+    assert_eq!(cache.get(&key), Some(vec![1u32, 2, 3]));
+    assert!(ages().iter().all(|age| age.as_secs() < 60), "{:?}", ages());
+    set_times(1800);
+    assert_eq!(cache.get(&key), Some(vec![1u32, 2, 3]));
+    assert!(ages().iter().all(|age| age.as_secs() >= 1800), "{:?}", ages());
+}
+
+#[test]
 fn what_is_not_the_stores_own_stays() {
     let (folder, cache, key) = filled();
     let mine =
