@@ -64,12 +64,21 @@ pub(crate) fn write(path: &Path, bytes: &[u8]) -> Result<()> {
 pub(crate) fn beside(path: &Path) -> Result<NamedTempFile> {
     let folder = folder_of(path);
     fs::create_dir_all(folder).map_err(failed(folder))?;
-    NamedTempFile::new_in(folder).map_err(failed(path))
+    NamedTempFile::new_in(of_any_length(folder)).map_err(failed(path))
 }
 
 /// The folder that a file is in.
 pub(crate) fn folder_of(path: &Path) -> &Path {
     path.parent().filter(|folder| *folder != Path::new("")).unwrap_or(Path::new("."))
+}
+
+/// A folder by a name that Windows takes at any length. std turns long paths into such names itself, but tempfile gives
+/// paths to Windows as they are, which refuses those of more than 260 characters. A program's manifest could ask for long
+/// paths too, but it counts only where the administrator has allowed them.
+pub(crate) fn of_any_length(folder: &Path) -> PathBuf {
+    // Some drives, such as RAM disks, have no such name.
+    let canonical = if cfg!(windows) { folder.canonicalize().ok() } else { None };
+    canonical.unwrap_or_else(|| folder.to_owned())
 }
 
 /// Moves a finished file to its place, readable by all as other outputs are.
@@ -80,13 +89,15 @@ pub(crate) fn persist(file: NamedTempFile, path: &Path) -> Result<()> {
 
 /// Moves a finished file over whatever is at `path`, in one step. Waits a little for other programs to close that.
 pub(crate) fn replace(file: NamedTempFile, path: &Path) -> Result<()> {
+    let name = path.file_name().filter(|_| cfg!(windows));
+    let place = name.map_or_else(|| path.to_owned(), |name| of_any_length(folder_of(path)).join(name));
     let mut file = Some(file.into_temp_path());
     let moved = patiently(
         &PAUSES,
         |error| keeps_from_replacing(error, path),
         || {
             let temporary = file.take().expect("a failed attempt gives it back");
-            temporary.persist(path).map_err(|e| {
+            temporary.persist(&place).map_err(|e| {
                 file = Some(e.path);
                 e.error
             })
@@ -167,6 +178,19 @@ mod tests {
         fs::create_dir_all(path.join("in it")).unwrap();
         assert!(matches!(write(&path, b"new"), Err(FileError::Io { .. })), "a folder is not in use");
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_path_may_be_longer_than_260_characters() {
+        let folder = tempfile::tempdir().unwrap();
+        let deep = folder.path().join("d".repeat(120)).join("e".repeat(120));
+        let path = deep.join("a.volpack");
+        assert!(path.as_os_str().len() > 260);
+        for bytes in [b"old", b"new"] {
+            write(&path, bytes).unwrap();
+            assert_eq!(fs::read(&path).unwrap(), bytes);
+        }
+        assert_eq!(fs::read_dir(&deep).unwrap().count(), 1);
     }
 
     #[cfg(windows)]

@@ -247,7 +247,7 @@ impl Store {
             return Ok(());
         }
         fs::create_dir_all(path.parent().unwrap_or(&self.root))?;
-        let mut file = tempfile::NamedTempFile::new_in(self.aside())?;
+        let mut file = tempfile::NamedTempFile::new_in(crate::atomic_file::of_any_length(&self.aside()))?;
         fill(file.as_file_mut())?;
         file.as_file().sync_all()?;
         // Others may share the store.
