@@ -8,6 +8,7 @@ use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
 use crate::error::{Error, Result};
+use crate::file_name::check_path;
 use crate::settings::{Budget, Settings, SettingsArgs, check_above_zero};
 
 /// The manifest's name where none is given.
@@ -158,6 +159,7 @@ impl RawAsset {
             OneOrMany::Many(many) => many,
         };
         let output = self.output.unwrap_or_else(|| PathBuf::from(format!("{name}.volpack")));
+        check_path(&output).map_err(|e| format!("output: {e}"))?;
         Ok(Asset {
             frames: frames.into_iter().map(|f| folder.join(f)).collect(),
             output: folder.join(output),
@@ -279,5 +281,16 @@ mod tests {
         assert!(error("[asset.a]\ngrid = 'x'\n").contains("missing field `frames`"));
         assert!(error("[asset.a]\nframes = 7\n").starts_with("line 2:"));
         assert!(error("[asset.a\n").starts_with("line 1:"));
+    }
+
+    #[test]
+    fn outputs_that_windows_does_not_take_are_refused_by_the_asset() {
+        assert_eq!(
+            error("[asset.Aux]\nframes = 'a.vdb'\n"),
+            "asset \"Aux\": output: \"Aux.volpack\" is the name of a device on Windows: choose another name"
+        );
+        assert!(error("[asset.a]\nframes = 'a.vdb'\noutput = 'nul/a.volpack'\n").starts_with("asset \"a\""));
+        let named = "[asset.aux]\nframes = 'nul.vdb'\noutput = 'a.volpack'\n";
+        assert!(Manifest::parse(named, Path::new("con")).is_ok(), "neither becomes the name of a file");
     }
 }

@@ -327,7 +327,12 @@ fn a_slip_in_the_arguments_costs_no_file() {
     std::fs::copy(fixture("levelset_half.vdb"), at.join("a.vdb")).unwrap();
     std::fs::copy(fixture("levelset_float.vdb"), at.join("b.vdb")).unwrap();
     let before = std::fs::read(at.join("b.vdb")).unwrap();
-    for (output, part) in [("a.vdb", "output too"), ("b.vdb", "is not a pack")] {
+    for (output, part) in [
+        ("a.vdb", "output too"),
+        ("b.vdb", "is not a pack"),
+        ("NUL.volpack", "name of a device"),
+        ("a.volpack.", "ends with a dot"),
+    ] {
         let (code, error) = failure(&volpack(at, &["build", "a.vdb", "-o", output]));
         assert!(code == 2 && error.contains(part), "{code} {error}");
     }
@@ -366,6 +371,12 @@ fn a_slip_in_the_arguments_costs_no_file() {
 
     for (manifest, args, expected, part) in [
         ("[asset.a]\nframes = []\n", vec!["build"], 3, "no frames"),
+        (
+            "[asset.con]\nframes = 'a.vdb'\n",
+            vec!["build"],
+            3,
+            "asset \"con\": output: \"con.volpack\" is the",
+        ),
         ("[asset.a]\nframes = 'a.vdb'\n", vec!["build", "-f", "bc7"], 2, "FILES"),
         ("[asset.a]\nframes = 'a.vdb'\nmax_flip = nan\n", vec!["build"], 3, "max_flip"),
         ("[asset.a]\nframes = 'no*.vdb'\n[asset.b]\nframes = 'b.vdb'\n", vec!["build"], 3, "no file matches"),

@@ -34,7 +34,7 @@ pub struct BuildArgs {
     #[arg(long, help_heading = "Output")]
     json: bool,
     /// Write a profile of all threads, for chrome://tracing or ui.perfetto.dev
-    #[arg(long, value_name = "FILE.json", help_heading = "Output")]
+    #[arg(long, value_name = "FILE.json", value_parser = super::output_path(), help_heading = "Output")]
     profile: Option<PathBuf>,
 }
 

@@ -10,6 +10,7 @@ use rayon::prelude::*;
 use super::style::{TITLE, WARNING};
 use super::{Common, exit_code, outln};
 use crate::error::{Error, Result};
+use crate::file_name::check_name;
 use crate::manifest::DEFAULT_NAME;
 use crate::sequence::{Numbering, Sequence, number, sequences};
 use crate::settings::Integers;
@@ -227,7 +228,7 @@ fn unique(sequence: &Sequence, taken: &[String]) -> String {
     let name = if name.is_empty() { "volume".to_owned() } else { name };
     let numbered = (2..).map(|n| format!("{name}-{n}"));
     let mut candidates = std::iter::once(name.clone()).chain(numbered);
-    candidates.find(|c| !taken.contains(c)).expect("numbers do not end")
+    candidates.find(|c| !taken.contains(c) && check_name(c).is_ok()).expect("numbers do not end")
 }
 
 /// Text as it can stand in a comment.

@@ -41,16 +41,16 @@ pub struct ReportArgs {
     #[arg(long, value_name = "FILES", num_args = 1.., requires = "packs")]
     source: Vec<PathBuf>,
     /// Write an HTML page with pictures and charts
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = super::output_path())]
     html: Option<PathBuf>,
     /// Write every figure as JSON (schema: volpack report --schema)
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = super::output_path())]
     json: Option<PathBuf>,
     /// Write a Markdown table for a review comment
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = super::output_path())]
     markdown: Option<PathBuf>,
     /// Write test results as JUnit XML
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = super::output_path())]
     junit: Option<PathBuf>,
     /// JSON of an older report, to list changes against
     #[arg(long, value_name = "FILE")]
