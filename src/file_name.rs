@@ -1,6 +1,6 @@
-//! Names of files that every system takes: a manifest is shared by people on different ones.
+//! Names of files that every system takes: manifests and reports are shared by people on different ones.
 
-use std::path::{Component, Path};
+use std::path::{Component, MAIN_SEPARATOR, Path};
 
 /// What Windows takes for a device, whatever the case and the extension: what is written to `nul.volpack` is gone.
 /// <https://learn.microsoft.com/windows/win32/fileio/naming-a-file>
@@ -41,6 +41,12 @@ pub(crate) fn check_name(name: &str) -> Result<(), String> {
     Ok(())
 }
 
+/// A path as manifests and reports have it on every system, so that they can be compared: with slashes.
+pub(crate) fn portable(path: &Path) -> String {
+    // No more than the separator of this system: elsewhere, a backslash is a part of a name.
+    path.to_string_lossy().replace(MAIN_SEPARATOR, "/")
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -71,6 +77,14 @@ mod tests {
         ] {
             assert_eq!(check_name(name), Ok(()), "{name}");
         }
+    }
+
+    #[test]
+    fn portable_paths_have_slashes() {
+        let path = Path::new("project").join("out").join("puff.volpack");
+        assert_eq!(portable(&path), "project/out/puff.volpack");
+        let with_backslash = if cfg!(windows) { "a/b" } else { "a\\b" };
+        assert_eq!(portable(Path::new("a\\b")), with_backslash);
     }
 
     #[test]

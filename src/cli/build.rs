@@ -10,6 +10,7 @@ use super::progress::Reporter;
 use super::style::{ERROR, GOOD, TITLE};
 use super::{Common, outln, print_json};
 use crate::error::{Error, Result};
+use crate::file_name::portable;
 use crate::pack::{Pack, Provenance};
 use crate::pipeline::{Job, Made, Outcome, VerifyLevel, build};
 use crate::report::model::{Figures, Total};
@@ -112,7 +113,7 @@ fn build_one(name: &str, job: &Job, args: &BuildArgs, common: Common, asset: &mu
     if !args.json && !common.quiet {
         print(name, job, &outcome, common.verbose);
     }
-    asset["output"] = json!(job.output);
+    asset["output"] = json!(portable(&job.output));
     asset["warnings"] = json!(outcome.warnings);
     asset["seconds"] = json!(outcome.build_report().stages);
     asset["pack"] = json!(outcome.summary);

@@ -10,7 +10,7 @@ use rayon::prelude::*;
 use super::style::{TITLE, WARNING};
 use super::{Common, exit_code, outln};
 use crate::error::{Error, Result};
-use crate::file_name::check_name;
+use crate::file_name::{check_name, portable};
 use crate::manifest::DEFAULT_NAME;
 use crate::sequence::{Numbering, Sequence, number, sequences};
 use crate::settings::Integers;
@@ -188,10 +188,8 @@ fn asset(name: &str, sequence: &Sequence) -> String {
 
 /// What stands for a sequence's files: one file by its name, several by globs.
 fn frames(sequence: &Sequence) -> Vec<String> {
-    // A manifest's paths have slashes on every system.
-    let text = |path: &Path| path.to_string_lossy().replace('\\', "/");
     if let [only] = &sequence.files[..] {
-        return vec![text(only)];
+        return vec![portable(only)];
     }
     let escaped = |part: &str| glob::Pattern::escape(part);
     let [before, after] = [&sequence.before, &sequence.after].map(|part| escaped(part));
@@ -199,7 +197,7 @@ fn frames(sequence: &Sequence) -> Vec<String> {
     sequence
         .number_globs
         .iter()
-        .map(|number| text(&folder.join(format!("{before}{number}{after}"))))
+        .map(|number| portable(&folder.join(format!("{before}{number}{after}"))))
         .collect()
 }
 
