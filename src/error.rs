@@ -20,6 +20,9 @@ pub enum Error {
         /// Why.
         source: std::io::Error,
     },
+    /// An output that cannot be replaced while another program has it open.
+    #[error("{} is open in another program: close it there, and build again", .0.display())]
+    InUse(PathBuf),
     /// An OpenVDB file that cannot be used.
     #[error("{}: {source}", path.display())]
     Vdb {
@@ -90,8 +93,11 @@ pub enum Error {
 }
 
 impl From<FileError> for Error {
-    fn from(FileError { path, source }: FileError) -> Self {
-        Self::Io { path, source }
+    fn from(error: FileError) -> Self {
+        match error {
+            FileError::Io { path, source } => Self::Io { path, source },
+            FileError::InUse(path) => Self::InUse(path),
+        }
     }
 }
 

@@ -60,6 +60,7 @@ pub mod codec;
 pub mod component;
 pub mod digest;
 pub mod error;
+mod file_name;
 pub mod file_stamp;
 pub mod manifest;
 pub mod pack;

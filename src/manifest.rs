@@ -3,11 +3,13 @@
 use std::collections::BTreeMap;
 use std::path::{Component, Path, PathBuf};
 
+use glob::{MatchOptions, glob_with};
 use serde::{Deserialize, Deserializer};
 use toml::Spanned;
 use toml::de::{DeTable, DeValue};
 
 use crate::error::{Error, Result};
+use crate::file_name::check_path;
 use crate::settings::{Budget, Settings, SettingsArgs, check_above_zero};
 
 /// The manifest's name where none is given.
@@ -158,6 +160,7 @@ impl RawAsset {
             OneOrMany::Many(many) => many,
         };
         let output = self.output.unwrap_or_else(|| PathBuf::from(format!("{name}.volpack")));
+        check_path(&output).map_err(|e| format!("output: {e}"))?;
         Ok(Asset {
             frames: frames.into_iter().map(|f| folder.join(f)).collect(),
             output: folder.join(output),
@@ -199,6 +202,13 @@ fn what_is_unknown(message: &str) -> &str {
     if message.starts_with("unknown variant") { "value" } else { "key" }
 }
 
+/// How globs match: upper and lower case are one where file names are found by either.
+const MATCHING: MatchOptions = MatchOptions {
+    case_sensitive: !cfg!(any(windows, target_os = "macos")),
+    require_literal_separator: false,
+    require_literal_leading_dot: false,
+};
+
 /// The files that globs and file names stand for, sorted within each glob.
 ///
 /// # Errors
@@ -212,7 +222,8 @@ pub fn expand(patterns: &[PathBuf]) -> Result<Vec<PathBuf>> {
             files.push(pattern.clone());
             continue;
         }
-        let matches = glob::glob(&glob_of(pattern)).map_err(|e| Error::Usage(format!("{text}: {e}")))?;
+        let matches =
+            glob_with(&glob_of(pattern), MATCHING).map_err(|e| Error::Usage(format!("{text}: {e}")))?;
         let before = files.len();
         for file in matches {
             files.push(file.map_err(|e| Error::Io { path: e.path().to_owned(), source: e.into() })?);
@@ -279,5 +290,50 @@ mod tests {
         assert!(error("[asset.a]\ngrid = 'x'\n").contains("missing field `frames`"));
         assert!(error("[asset.a]\nframes = 7\n").starts_with("line 2:"));
         assert!(error("[asset.a\n").starts_with("line 1:"));
+    }
+
+    /// The names of the files that a manifest's globs stand for.
+    fn expanded(folder: &Path, frames: &str) -> Vec<String> {
+        let manifest = Manifest::parse(&format!("[asset.a]\nframes = '{frames}'\n"), folder).unwrap();
+        let files = expand(&manifest.assets["a"].frames).unwrap_or_default();
+        files.iter().map(|file| file.file_name().unwrap().to_string_lossy().into_owned()).collect()
+    }
+
+    #[test]
+    fn folders_may_have_brackets_in_their_names() {
+        let folder = tempfile::tempdir().unwrap();
+        let project = folder.path().join("x[1]");
+        let frames = project.join("sim[a-z]");
+        std::fs::create_dir_all(&frames).unwrap();
+        for name in ["a_1.vdb", "a_2.vdb", "b[1].vdb"] {
+            std::fs::write(frames.join(name), "").unwrap();
+        }
+        // It matches the folder's name as a pattern.
+        std::fs::create_dir(folder.path().join("x1")).unwrap();
+        assert_eq!(expanded(&project, "sim[a-z]/*.vdb"), ["a_1.vdb", "a_2.vdb", "b[1].vdb"]);
+        assert_eq!(expanded(&project, "sim*/a_[0-9].vdb"), ["a_1.vdb", "a_2.vdb"]);
+        assert_eq!(expanded(&project, "../x[1]/sim[a-z]/b[1].vdb"), ["b[1].vdb"]);
+    }
+
+    #[test]
+    fn globs_match_by_the_case_rule_of_the_system() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["Puff_1.VDB", "puff_2.vdb"] {
+            std::fs::write(folder.path().join(name), "").unwrap();
+        }
+        let is_one = cfg!(any(windows, target_os = "macos"));
+        let expected: &[&str] = if is_one { &["Puff_1.VDB", "puff_2.vdb"] } else { &["puff_2.vdb"] };
+        assert_eq!(expanded(folder.path(), "puff_*.vdb"), expected);
+    }
+
+    #[test]
+    fn outputs_that_windows_does_not_take_are_refused_by_the_asset() {
+        assert_eq!(
+            error("[asset.Aux]\nframes = 'a.vdb'\n"),
+            "asset \"Aux\": output: \"Aux.volpack\" is the name of a device on Windows: choose another name"
+        );
+        assert!(error("[asset.a]\nframes = 'a.vdb'\noutput = 'nul/a.volpack'\n").starts_with("asset \"a\""));
+        let named = "[asset.aux]\nframes = 'nul.vdb'\noutput = 'a.volpack'\n";
+        assert!(Manifest::parse(named, Path::new("con")).is_ok(), "neither becomes the name of a file");
     }
 }

@@ -10,12 +10,13 @@ use std::path::{Path, PathBuf};
 
 /// The rooms from the ground up. Each may know those before it, and none after it. A room is a module with all that is in
 /// it, but for what is a room of its own; the crate `volpack_x` is the room `x`.
-const ROOMS: [&str; 37] = [
+const ROOMS: [&str; 38] = [
     "format",
     "units",
     "cancel",
     "progress",
     "pods",
+    "file_name",
     "file_stamp",
     "volume",
     "codec",

@@ -327,11 +327,32 @@ fn a_slip_in_the_arguments_costs_no_file() {
     std::fs::copy(fixture("levelset_half.vdb"), at.join("a.vdb")).unwrap();
     std::fs::copy(fixture("levelset_float.vdb"), at.join("b.vdb")).unwrap();
     let before = std::fs::read(at.join("b.vdb")).unwrap();
-    for (output, part) in [("a.vdb", "output too"), ("b.vdb", "is not a pack")] {
+    for (output, part) in [
+        ("a.vdb", "output too"),
+        ("b.vdb", "is not a pack"),
+        ("NUL.volpack", "name of a device"),
+        ("a.volpack.", "ends with a dot"),
+    ] {
         let (code, error) = failure(&volpack(at, &["build", "a.vdb", "-o", output]));
         assert!(code == 2 && error.contains(part), "{code} {error}");
     }
     assert_eq!(std::fs::read(at.join("b.vdb")).unwrap(), before);
+
+    // Nobody can tell what an output is that cannot be read. This one gives an I/O error, to root as well.
+    #[cfg(target_os = "linux")]
+    {
+        let (_, error) = failure(&volpack(at, &["build", "a.vdb", "-o", "/proc/self/mem"]));
+        assert!(error.contains("/proc/self/mem: the output exists and cannot be read, so it is"), "{error}");
+    }
+    #[cfg(windows)]
+    {
+        use std::os::windows::fs::OpenOptionsExt;
+        std::fs::write(at.join("open.volpack"), "").unwrap();
+        let open = std::fs::OpenOptions::new().read(true).share_mode(0).open(at.join("open.volpack"));
+        let (code, error) = failure(&volpack(at, &["build", "a.vdb", "-o", "open.volpack"]));
+        assert!(code == 1 && error.contains("open.volpack is open in another program"), "{code} {error}");
+        drop(open);
+    }
 
     // A pack that fails verification does not take the place of one that passed.
     stdout(&volpack(at, &["build", "a.vdb", "-o", "a.volpack", "--verify", "voxels"]));
@@ -350,6 +371,12 @@ fn a_slip_in_the_arguments_costs_no_file() {
 
     for (manifest, args, expected, part) in [
         ("[asset.a]\nframes = []\n", vec!["build"], 3, "no frames"),
+        (
+            "[asset.con]\nframes = 'a.vdb'\n",
+            vec!["build"],
+            3,
+            "asset \"con\": output: \"con.volpack\" is the",
+        ),
         ("[asset.a]\nframes = 'a.vdb'\n", vec!["build", "-f", "bc7"], 2, "FILES"),
         ("[asset.a]\nframes = 'a.vdb'\nmax_flip = nan\n", vec!["build"], 3, "max_flip"),
         ("[asset.a]\nframes = 'no*.vdb'\n[asset.b]\nframes = 'b.vdb'\n", vec!["build"], 3, "no file matches"),

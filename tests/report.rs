@@ -84,6 +84,11 @@ fn json_is_as_its_schema_says_and_the_schema_is_documented() {
         puff["summary"]["codecs"].as_object().unwrap().values().filter_map(|c| c["bytes"].as_u64()).sum();
     // Pages are filled up to whole slabs.
     assert!(new > 0 && new <= texels, "{new} {texels}");
+
+    assert_eq!(puff["file"], "puff.volpack");
+    let manifest = folder.path().join("pipeline.toml");
+    let (_, json, _) = report(folder.path(), &["-m", manifest.to_str().unwrap(), "--asset", "ball"]);
+    assert_eq!(json["assets"][0]["pack"]["file"], "ball.volpack", "relative to the manifest");
 }
 
 #[test]

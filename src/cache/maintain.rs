@@ -35,13 +35,49 @@ pub struct StageStats {
     pub bytes: u64,
 }
 
-/// An entry that is not what it should be.
+/// An entry with which something is wrong.
 #[derive(Clone, Debug, Serialize)]
-pub struct Damage {
+pub struct Fault {
     /// The file.
     pub path: PathBuf,
     /// What is wrong with it.
     pub why: String,
+}
+
+/// What [`Cache::verify`] found.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Verified {
+    /// Damaged entries, which are gone.
+    pub removed: Vec<Fault>,
+    /// Entries that cannot be read, or are damaged and cannot be removed: another program has them open, or the user has
+    /// no permission. They stay.
+    pub left: Vec<Fault>,
+}
+
+impl Verified {
+    /// Whether every entry was read and is sound.
+    pub fn is_sound(&self) -> bool {
+        self.removed.is_empty() && self.left.is_empty()
+    }
+}
+
+/// What was removed from a store.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct Removed {
+    /// The number of files.
+    pub files: u64,
+    /// Their bytes.
+    pub bytes: u64,
+    /// Files that could not be removed.
+    pub left: Vec<Fault>,
+}
+
+/// Why an entry cannot be used.
+enum Unsound {
+    /// It was read, and is not what was written.
+    Damaged(String),
+    /// Nobody can tell.
+    Unreadable(io::Error),
 }
 
 /// One file of the store.
@@ -75,11 +111,11 @@ impl Cache {
     }
 
     /// Removes what was not used for `max_age`, then what was not used for longest until the rest takes at most
-    /// `max_bytes`. Gives the number of files removed and their bytes.
+    /// `max_bytes`.
     ///
     /// # Errors
     /// When a folder of the store cannot be listed.
-    pub fn collect(&self, max_bytes: Option<u64>, max_age: Option<Duration>) -> io::Result<(u64, u64)> {
+    pub fn collect(&self, max_bytes: Option<u64>, max_age: Option<Duration>) -> io::Result<Removed> {
         let now = SystemTime::now();
         let age = |found: &Found| now.duration_since(found.used).unwrap_or_default();
         let mut files = Vec::new();
@@ -102,38 +138,47 @@ impl Cache {
         Ok(remove(&gone))
     }
 
-    /// Reads every entry, and removes those that are damaged.
+    /// Reads every entry, and removes those that are damaged. One that cannot be read may be sound, and stays.
     ///
     /// # Errors
     /// When a folder of the store cannot be listed.
-    pub fn verify(&self) -> io::Result<Vec<Damage>> {
+    pub fn verify(&self) -> io::Result<Verified> {
         let actions = self.files(Map::Actions.folder())?;
         let blobs = self.files(Map::Blobs.folder())?;
         let sound_action = |found: &Found| Entry::read(&found.path).map(drop);
         let sound_blob = |found: &Found| {
             let mut hasher = blake3::Hasher::new();
-            hasher.update_mmap(&found.path).map_err(|e| e.to_string())?;
+            hasher.update_mmap(&found.path).map_err(Unsound::Unreadable)?;
             let is_named = digest_in_name(&found.path) == Some(hasher.finalize());
-            if is_named { Ok(()) } else { Err("its digest is not its name".to_owned()) }
+            if is_named { Ok(()) } else { Err(Unsound::Damaged("its digest is not its name".to_owned())) }
         };
-        let mut damaged: Vec<Damage> = Vec::new();
-        let damage = |found: &Found, sound: Result<(), String>| {
+        let mut unsound: Vec<(PathBuf, Unsound)> = Vec::new();
+        let if_unsound = |found: &Found, sound: Result<(), Unsound>| {
             // What another process removed meanwhile is not damaged.
-            sound.err().filter(|_| found.path.exists()).map(|why| Damage { path: found.path.clone(), why })
+            sound.err().filter(|_| found.path.exists()).map(|why| (found.path.clone(), why))
         };
-        damaged.par_extend(actions.par_iter().filter_map(|f| damage(f, sound_action(f))));
-        damaged.par_extend(blobs.par_iter().filter_map(|f| damage(f, sound_blob(f))));
-        for entry in &damaged {
-            let _ = fs::remove_file(&entry.path);
+        unsound.par_extend(actions.par_iter().filter_map(|f| if_unsound(f, sound_action(f))));
+        unsound.par_extend(blobs.par_iter().filter_map(|f| if_unsound(f, sound_blob(f))));
+        let mut verified = Verified::default();
+        for (path, why) in unsound {
+            match why {
+                Unsound::Unreadable(e) => verified.left.push(Fault { path, why: e.to_string() }),
+                Unsound::Damaged(why) => match remove_file(&path) {
+                    Ok(_) => verified.removed.push(Fault { path, why }),
+                    Err(e) => {
+                        verified.left.push(Fault { path, why: format!("{why}; it cannot be removed: {e}") });
+                    }
+                },
+            }
         }
-        Ok(damaged)
+        Ok(verified)
     }
 
-    /// Removes everything that the store made, and nothing else. Gives the number of files and their bytes.
+    /// Removes everything that the store made, and nothing else.
     ///
     /// # Errors
     /// When a folder of the store cannot be listed.
-    pub fn clear(&self) -> io::Result<(u64, u64)> {
+    pub fn clear(&self) -> io::Result<Removed> {
         let mut all = Vec::new();
         for folder in [Map::Actions.folder(), Map::Blobs.folder(), STAMPS, ASIDE] {
             all.extend(self.files(folder)?);
@@ -171,16 +216,34 @@ impl Cache {
     }
 }
 
-/// Removes files, as far as another process was not quicker. Gives their number and their bytes.
-fn remove(files: &[Found]) -> (u64, u64) {
-    let removed = files.iter().filter(|found| fs::remove_file(&found.path).is_ok());
-    removed.fold((0, 0), |(files, bytes), found| (files + 1, bytes + found.bytes))
+/// Removes files, as far as another process was not quicker.
+fn remove(files: &[Found]) -> Removed {
+    let mut removed = Removed::default();
+    for found in files {
+        match remove_file(&found.path) {
+            Ok(was_there) => {
+                removed.files += u64::from(was_there);
+                removed.bytes += if was_there { found.bytes } else { 0 };
+            }
+            Err(e) => removed.left.push(Fault { path: found.path.clone(), why: e.to_string() }),
+        }
+    }
+    removed
+}
+
+/// Removes a file; whether it was still there.
+fn remove_file(path: &Path) -> io::Result<bool> {
+    match fs::remove_file(path) {
+        Ok(()) => Ok(true),
+        Err(e) if e.kind() == io::ErrorKind::NotFound => Ok(false),
+        Err(e) => Err(e),
+    }
 }
 
 impl Entry {
-    fn read(path: &Path) -> Result<Self, String> {
-        let bytes = fs::read(path).map_err(|e| e.to_string())?;
-        Self::from_bytes(&bytes).map_err(str::to_owned)
+    fn read(path: &Path) -> Result<Self, Unsound> {
+        let bytes = fs::read(path).map_err(Unsound::Unreadable)?;
+        Self::from_bytes(&bytes).map_err(|why| Unsound::Damaged(why.to_owned()))
     }
 }
 
@@ -194,4 +257,22 @@ fn digest_in_name(path: &Path) -> Option<blake3::Hash> {
     let name = path.file_name()?.to_str()?;
     let folder = path.parent()?.file_name()?.to_str()?;
     blake3::Hash::from_hex(format!("{folder}{name}")).ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cannot_be_removed_is_told_and_what_is_gone_is_not() {
+        let folder = tempfile::tempdir().unwrap();
+        let found =
+            |name: &str| Found { path: folder.path().join(name), bytes: 7, used: SystemTime::UNIX_EPOCH };
+        // A folder is what `remove_file` refuses on every system, as Windows does a file that is open.
+        fs::create_dir(folder.path().join("folder")).unwrap();
+        fs::write(folder.path().join("file"), "1234567").unwrap();
+        let removed = remove(&["folder", "file", "gone"].map(found));
+        assert_eq!((removed.files, removed.bytes), (1, 7));
+        assert_eq!(removed.left.iter().map(|f| &*f.path).collect::<Vec<_>>(), [folder.path().join("folder")]);
+    }
 }

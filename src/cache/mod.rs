@@ -31,7 +31,7 @@ use serde::Serialize;
 use serde::de::DeserializeOwned;
 
 pub use key::{Key, Namespace};
-pub use maintain::{Damage, Stats};
+pub use maintain::{Fault, Removed, Stats, Verified};
 
 use remote::Remote;
 use store::{Entry, Map, Store};

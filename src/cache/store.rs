@@ -204,15 +204,16 @@ impl Store {
         }
         let mut bytes = Vec::with_capacity(length as usize);
         io::Read::by_ref(&mut file).take(length).read_to_end(&mut bytes).map_err(unreadable)?;
-        note_use(&file, &metadata);
+        note_use(path, &metadata);
         parse(bytes).map(Some).map_err(|why| unusable(why.to_owned()))
     }
 
     /// Opens a blob of the right length, to be checked by who reads it.
     pub fn open_blob(&self, blob: &Blob) -> Option<File> {
-        let file = File::open(self.path(Map::Blobs, &blob.digest)).ok()?;
+        let path = self.path(Map::Blobs, &blob.digest);
+        let file = File::open(&path).ok()?;
         let metadata = file.metadata().ok()?;
-        note_use(&file, &metadata);
+        note_use(&path, &metadata);
         (metadata.len() == blob.bytes).then_some(file)
     }
 
@@ -246,20 +247,34 @@ impl Store {
             return Ok(());
         }
         fs::create_dir_all(path.parent().unwrap_or(&self.root))?;
-        let mut file = tempfile::NamedTempFile::new_in(self.aside())?;
+        let mut file = tempfile::NamedTempFile::new_in(crate::atomic_file::of_any_length(&self.aside()))?;
         fill(file.as_file_mut())?;
         file.as_file().sync_all()?;
         // Others may share the store.
         crate::atomic_file::make_readable(file.as_file())?;
-        file.persist(path).map(drop).map_err(|e| e.error)
+        Ok(crate::atomic_file::replace(file, &path)?)
     }
 }
 
-fn note_use(file: &File, metadata: &fs::Metadata) {
+fn note_use(path: &Path, metadata: &fs::Metadata) {
     let now = SystemTime::now();
     let noted = metadata.modified().ok().and_then(|then| now.duration_since(then).ok());
     if noted.is_some_and(|age| age > USE_NOTED) {
         // A store that can only be read is as good.
-        let _ = file.set_modified(now);
+        let _ = open_to_set_times(path).and_then(|file| file.set_modified(now));
     }
+}
+
+/// Opens a file to set its times. Windows asks for a right of its own, which opening to read does not give, and grants it
+/// whoever has the file open.
+fn open_to_set_times(path: &Path) -> io::Result<File> {
+    let mut options = File::options();
+    options.read(true);
+    #[cfg(windows)]
+    {
+        use std::os::windows::fs::OpenOptionsExt;
+        use windows_sys::Win32::Storage::FileSystem::FILE_WRITE_ATTRIBUTES;
+        options.access_mode(FILE_WRITE_ATTRIBUTES);
+    }
+    options.open(path)
 }

@@ -10,6 +10,7 @@ use super::progress::Reporter;
 use super::style::{ERROR, GOOD, TITLE};
 use super::{Common, outln, print_json};
 use crate::error::{Error, Result};
+use crate::file_name::portable;
 use crate::pack::{Pack, Provenance};
 use crate::pipeline::{Job, Made, Outcome, VerifyLevel, build};
 use crate::report::model::{Figures, Total};
@@ -34,7 +35,7 @@ pub struct BuildArgs {
     #[arg(long, help_heading = "Output")]
     json: bool,
     /// Write a profile of all threads, for chrome://tracing or ui.perfetto.dev
-    #[arg(long, value_name = "FILE.json", help_heading = "Output")]
+    #[arg(long, value_name = "FILE.json", value_parser = super::output_path(), help_heading = "Output")]
     profile: Option<PathBuf>,
 }
 
@@ -112,7 +113,7 @@ fn build_one(name: &str, job: &Job, args: &BuildArgs, common: Common, asset: &mu
     if !args.json && !common.quiet {
         print(name, job, &outcome, common.verbose);
     }
-    asset["output"] = json!(job.output);
+    asset["output"] = json!(portable(&job.output));
     asset["warnings"] = json!(outcome.warnings);
     asset["seconds"] = json!(outcome.build_report().stages);
     asset["pack"] = json!(outcome.summary);

@@ -1,6 +1,6 @@
 //! `volpack cache`, and what other commands say of it.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -10,8 +10,8 @@ use serde_json::json;
 use super::progress::Reporter;
 use super::style::{GOOD, TITLE, WARNING};
 use super::{Common, interrupt, outln, print_json};
-use crate::cache::Cache;
 use crate::cache::remote::{Policy, Remote};
+use crate::cache::{Cache, Fault, Removed, Verified};
 use crate::error::{Error, Result};
 use crate::progress::Progress;
 use crate::settings::ByteSize;
@@ -196,30 +196,60 @@ pub fn run(args: &Arguments, common: Common) -> Result<()> {
             say(json!({ "folder": folder, "stats": stats }), text);
         }
         Command::Gc { max_size, max_age } => {
-            let (files, size) = cache.collect(max_size.map(|s| s.0), *max_age).map_err(failed())?;
-            say(json!({ "files": files, "bytes": size }), removed(files, size));
+            let removed = cache.collect(max_size.map(|s| s.0), *max_age).map_err(failed())?;
+            say(json!(removed), in_words(&removed));
+            none_left(&folder, &removed)?;
         }
         Command::Clear => {
-            let (files, size) = cache.clear().map_err(failed())?;
-            say(json!({ "files": files, "bytes": size }), removed(files, size));
+            let removed = cache.clear().map_err(failed())?;
+            say(json!(removed), in_words(&removed));
+            none_left(&folder, &removed)?;
         }
         Command::Verify => {
-            let damaged = cache.verify().map_err(failed())?;
-            if !damaged.is_empty() {
-                if args.json {
-                    print_json(&json!({ "ok": false, "removed": damaged }));
-                }
-                let each = damaged.iter().map(|d| format!("\n  {}: {}", d.path.display(), d.why));
-                let message =
-                    format!("{} damaged entries were removed:{}", damaged.len(), each.collect::<String>());
-                return Err(Error::Input(format!("{}: {message}", folder.display())));
+            let verified = cache.verify().map_err(failed())?;
+            if verified.is_sound() {
+                say(json!({ "ok": true }), format!("{GOOD}ok{GOOD:#}"));
+                return Ok(());
             }
-            say(json!({ "ok": true }), format!("{GOOD}ok{GOOD:#}"));
+            let Verified { removed, left } = verified;
+            if args.json {
+                print_json(&json!({ "ok": false, "removed": removed, "left": left }));
+            }
+            let mut message = String::new();
+            if !removed.is_empty() {
+                message += &format!("{} damaged entries were removed:{}", removed.len(), lines(&removed));
+            }
+            if !left.is_empty() {
+                let separator = if message.is_empty() { "" } else { "\n" };
+                message += &format!(
+                    "{separator}{} entries could not be verified or removed: {CLOSE}:{}",
+                    left.len(),
+                    lines(&left)
+                );
+            }
+            let message = format!("{}: {message}", folder.display());
+            return Err(if removed.is_empty() { Error::Other(message) } else { Error::Input(message) });
         }
     }
     Ok(())
 }
 
-fn removed(files: u64, size: u64) -> String {
-    format!("removed {} in {} files", bytes(size), count(files))
+/// What to do about entries that cannot be read or removed.
+const CLOSE: &str = "close the programs that use the cache, or check the permissions, and try again";
+
+fn in_words(removed: &Removed) -> String {
+    format!("removed {} in {} files", bytes(removed.bytes), count(removed.files))
+}
+
+/// Ends a command that could not remove everything it should.
+fn none_left(folder: &Path, Removed { left, .. }: &Removed) -> Result<()> {
+    if left.is_empty() {
+        return Ok(());
+    }
+    let message = format!("{} files could not be removed: {CLOSE}:{}", left.len(), lines(left));
+    Err(Error::Other(format!("{}: {message}", folder.display())))
+}
+
+fn lines(faults: &[Fault]) -> String {
+    faults.iter().map(|fault| format!("\n  {}: {}", fault.path.display(), fault.why)).collect()
 }

@@ -17,7 +17,7 @@ pub fn of(error: &Error) -> u8 {
             | ErrorKind::InvalidData => 3,
             _ => 1,
         },
-        Error::Other(_) => 1,
+        Error::InUse(_) | Error::Other(_) => 1,
         Error::Usage(_) => 2,
         Error::Vdb { source, .. } if source.is_unsupported() => 6,
         Error::Pack { source, .. } if source.is_unsupported() => 6,

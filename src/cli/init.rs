@@ -10,6 +10,7 @@ use rayon::prelude::*;
 use super::style::{TITLE, WARNING};
 use super::{Common, exit_code, outln};
 use crate::error::{Error, Result};
+use crate::file_name::{check_name, portable};
 use crate::manifest::DEFAULT_NAME;
 use crate::sequence::{Numbering, Sequence, number, sequences};
 use crate::settings::Integers;
@@ -187,10 +188,8 @@ fn asset(name: &str, sequence: &Sequence) -> String {
 
 /// What stands for a sequence's files: one file by its name, several by globs.
 fn frames(sequence: &Sequence) -> Vec<String> {
-    // A manifest's paths have slashes on every system.
-    let text = |path: &Path| path.to_string_lossy().replace('\\', "/");
     if let [only] = &sequence.files[..] {
-        return vec![text(only)];
+        return vec![portable(only)];
     }
     let escaped = |part: &str| glob::Pattern::escape(part);
     let [before, after] = [&sequence.before, &sequence.after].map(|part| escaped(part));
@@ -198,7 +197,7 @@ fn frames(sequence: &Sequence) -> Vec<String> {
     sequence
         .number_globs
         .iter()
-        .map(|number| text(&folder.join(format!("{before}{number}{after}"))))
+        .map(|number| portable(&folder.join(format!("{before}{number}{after}"))))
         .collect()
 }
 
@@ -227,7 +226,7 @@ fn unique(sequence: &Sequence, taken: &[String]) -> String {
     let name = if name.is_empty() { "volume".to_owned() } else { name };
     let numbered = (2..).map(|n| format!("{name}-{n}"));
     let mut candidates = std::iter::once(name.clone()).chain(numbered);
-    candidates.find(|c| !taken.contains(c)).expect("numbers do not end")
+    candidates.find(|c| !taken.contains(c) && check_name(c).is_ok()).expect("numbers do not end")
 }
 
 /// Text as it can stand in a comment.

@@ -27,7 +27,7 @@ pub struct JobArgs {
     #[arg(long = "asset", value_name = "NAME", help_heading = "Input")]
     assets: Vec<String>,
     /// Pack to write, for FILES
-    #[arg(short, long, value_name = "OUT.volpack", requires = "frames", help_heading = "Output")]
+    #[arg(short, long, value_name = "OUT.volpack", value_parser = super::output_path(), requires = "frames", help_heading = "Output")]
     output: Option<PathBuf>,
     #[command(flatten)]
     settings: SettingsArgs,

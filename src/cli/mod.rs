@@ -18,9 +18,11 @@ mod watch;
 
 use std::path::PathBuf;
 
+use clap::builder::{PathBufValueParser, TypedValueParser};
 use clap::{Args, Parser, Subcommand};
 
 use crate::error::{Error, Result};
+use crate::file_name::check_name;
 use crate::pipeline::VerifyLevel;
 use crate::render::Device;
 use crate::settings::{ByteSize, above_zero};
@@ -112,11 +114,19 @@ struct VerifyArg {
     pictures: PictureArgs,
 }
 
+/// Reads the path of an output. Names that Windows does not take are refused on every system, since scripts are shared.
+fn output_path() -> impl TypedValueParser<Value = PathBuf> {
+    PathBufValueParser::new().try_map(|path| {
+        check_name(&path.file_name().unwrap_or_default().to_string_lossy())?;
+        Ok::<_, String>(path)
+    })
+}
+
 /// How pictures are compared, as the command line has it.
 #[derive(Args)]
 struct PictureArgs {
     /// Write pictures of source, pack and difference into this folder
-    #[arg(long, value_name = "DIR", help_heading = "Verification")]
+    #[arg(long, value_name = "DIR", value_parser = output_path(), help_heading = "Verification")]
     images: Option<PathBuf>,
     /// Maximum visual difference (mean FLIP, 0 to 1) [default: the manifest's; if there is none, more than 0.04 is a warning]
     #[arg(long, value_name = "FLIP", value_parser = above_zero, help_heading = "Verification")]

@@ -17,7 +17,7 @@ pub struct RenderArgs {
     /// Pack to render
     pack: PathBuf,
     /// Picture to write: .png, or .apng with --frames all
-    #[arg(short, long, value_name = "OUT.png")]
+    #[arg(short, long, value_name = "OUT.png", value_parser = super::output_path())]
     output: PathBuf,
     /// Frame number [default: the first]
     #[arg(long, value_name = "N", allow_negative_numbers = true)]

@@ -14,6 +14,7 @@ use crate::atomic_file;
 use crate::cache::Cache;
 use crate::digest::digest;
 use crate::error::{Error, Result};
+use crate::file_name::portable;
 use crate::manifest::{DEFAULT_NAME, expand};
 use crate::pack::{Pack, Provenance};
 use crate::pipeline::{Job, Outcome, Resources, VerifyLevel, build, check_structure, verify_against};
@@ -41,16 +42,16 @@ pub struct ReportArgs {
     #[arg(long, value_name = "FILES", num_args = 1.., requires = "packs")]
     source: Vec<PathBuf>,
     /// Write an HTML page with pictures and charts
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = super::output_path())]
     html: Option<PathBuf>,
     /// Write every figure as JSON (schema: volpack report --schema)
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = super::output_path())]
     json: Option<PathBuf>,
     /// Write a Markdown table for a review comment
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = super::output_path())]
     markdown: Option<PathBuf>,
     /// Write test results as JUnit XML
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", value_parser = super::output_path())]
     junit: Option<PathBuf>,
     /// JSON of an older report, to list changes against
     #[arg(long, value_name = "FILE")]
@@ -129,7 +130,7 @@ pub fn run(args: &ReportArgs, common: Common) -> Result<()> {
         for path in &packs {
             // Two of one name are told apart by their folders.
             let is_alone = packs.iter().filter(|other| stem(other) == stem(path)).count() == 1;
-            let name = if is_alone { stem(path) } else { path.with_extension("").display().to_string() };
+            let name = if is_alone { stem(path) } else { portable(&path.with_extension("")) };
             gathering.add(&name, |gathering| gathering.look(&name, path, &sources))?;
         }
     }
@@ -197,6 +198,7 @@ impl Gathering<'_> {
             pack: &pack,
             provenance: &provenance,
             file: &job.output,
+            base: self.args.manifest.parent().unwrap_or(Path::new("")),
             digest: digest(&job.output)?.0,
             summary,
             found: verification,
@@ -204,7 +206,7 @@ impl Gathering<'_> {
             cheaper,
             command: format!(
                 "volpack build -m {} --asset {}",
-                quoted(&self.args.manifest.to_string_lossy()),
+                quoted(&portable(&self.args.manifest)),
                 quoted(name)
             ),
             budget: limits,
@@ -234,12 +236,13 @@ impl Gathering<'_> {
             pack: &pack,
             provenance: &provenance,
             file: path,
+            base: Path::new(""),
             digest: digest(path)?.0,
             summary: PackSummary::new(&pack),
             found,
             build: None,
             cheaper: None,
-            command: format!("volpack verify {} --source FILES", quoted(&path.to_string_lossy())),
+            command: format!("volpack verify {} --source FILES", quoted(&portable(path))),
             budget: &Budget::default(),
             baseline: self.baseline,
         };
@@ -272,8 +275,8 @@ impl Gathering<'_> {
     /// Writes what was asked for, and says how it went.
     fn finish(self, budget: &Budget) -> Result<()> {
         let args = self.args;
-        let manifest = args.packs.is_empty().then(|| args.manifest.display().to_string());
-        let baseline = args.baseline.as_ref().map(|path| path.display().to_string());
+        let manifest = args.packs.is_empty().then(|| portable(&args.manifest));
+        let baseline = args.baseline.as_ref().map(|path| portable(path));
         let report = Report::new(self.assets, self.breaches, budget, manifest, baseline);
         let other = |e: &dyn std::fmt::Display| Error::Other(format!("the report cannot be written: {e}"));
         if let Some(path) = &args.json {

@@ -23,7 +23,7 @@ pub struct SweepArgs {
     #[arg(required = true)]
     files: Vec<PathBuf>,
     /// Folder for sweep.csv, sweep.json and sweep.svg
-    #[arg(short, long, value_name = "DIR")]
+    #[arg(short, long, value_name = "DIR", value_parser = super::output_path())]
     output: PathBuf,
     /// Measure stability instead: repeat each method with other seeds, frame orders, thread counts and noise, and write
     /// stability.csv, stability.json and stability.svg

@@ -18,6 +18,10 @@ use crate::units::{bytes, count, psnr, seconds};
 /// How often files are looked at. Asking beats being told: network drives, where farms render to, tell nothing.
 const LOOK_EVERY: Duration = Duration::from_millis(200);
 
+/// How long a pack that another program has open is left alone. Nothing tells when it is closed, and each try makes the
+/// pack again, if only out of the cache.
+const IN_USE: Duration = Duration::from_secs(5);
+
 /// A frame that cannot be read is still being written while its last change is no longer ago than this.
 const STILL_WRITTEN: Duration = Duration::from_secs(10);
 
@@ -41,8 +45,29 @@ struct Seen {
 struct Asset {
     seen: Seen,
     since: Instant,
-    /// Whether it was built, or found wanting, since it changed.
-    is_done: bool,
+    /// What came of building it since it changed.
+    state: State,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum State {
+    /// It is not built yet, or was a moment too early.
+    Waiting,
+    /// Its pack could not be replaced when it was last tried, since another program has it open.
+    InUse(Instant),
+    /// It was built, or found wanting.
+    Done,
+}
+
+impl Asset {
+    /// Whether it is to be built now, given that it did not change.
+    fn is_due(&self, now: Instant, settle: Duration) -> bool {
+        match self.state {
+            State::Waiting => now.duration_since(self.since) >= settle,
+            State::InUse(tried) => now.duration_since(tried) >= IN_USE,
+            State::Done => false,
+        }
+    }
 }
 
 /// Keeps warnings for the one line.
@@ -108,31 +133,40 @@ fn look(
     let asset = match assets.get_mut(name) {
         Some(asset) if asset.seen == seen => asset,
         _ => {
-            assets.insert(name.to_owned(), Asset { seen, since: now, is_done: false });
+            assets.insert(name.to_owned(), Asset { seen, since: now, state: State::Waiting });
             return;
         }
     };
-    if asset.is_done || now.duration_since(asset.since) < settle {
+    if !asset.is_due(now, settle) {
         return;
     }
-    match job {
+    asset.state = match job {
         Err(error) => {
             outln!("{TITLE}{name}{TITLE:#}: waiting: {error}");
-            asset.is_done = true;
+            State::Done
         }
-        Ok(job) => asset.is_done = build_one(name, &job, common),
-    }
+        Ok(job) => build_one(name, &job, asset.state, common),
+    };
 }
 
-/// Builds and prints the one line. Whether that is all until something changes.
-fn build_one(name: &str, job: &Job, common: Common) -> bool {
+/// Builds and prints the one line, but for what was said `before`.
+fn build_one(name: &str, job: &Job, before: State, common: Common) -> State {
     let start = Instant::now();
     let mut progress = Quiet::default();
     let outcome = build(job, &mut progress);
     let warnings = progress.0.iter().map(|w| format!("; {WARNING}{w}{WARNING:#}")).collect::<String>();
     match outcome {
         Err(Error::Cancelled(_)) => {}
-        Err(Error::Vdb { path, .. } | Error::Changed(path)) if is_being_written(&path) => return false,
+        Err(Error::Vdb { path, .. } | Error::Changed(path)) if is_being_written(&path) => {
+            return State::Waiting;
+        }
+        Err(Error::InUse(path)) => {
+            if !matches!(before, State::InUse(_)) {
+                let path = path.display();
+                outln!("{TITLE}{name}{TITLE:#}: waiting: {path} is open in another program: close it there");
+            }
+            return State::InUse(Instant::now());
+        }
         Err(error) => {
             outln!("{TITLE}{name}{TITLE:#}: {ERROR}kept the last good pack{ERROR:#}: {error}");
         }
@@ -151,7 +185,7 @@ fn build_one(name: &str, job: &Job, common: Common) -> bool {
             }
         }
     }
-    true
+    State::Done
 }
 
 fn is_being_written(path: &std::path::Path) -> bool {
@@ -178,4 +212,21 @@ fn summary(outcome: &Outcome) -> String {
         },
     };
     format!("{how}: {} {frames}, {}{quality}", pack.frames, bytes(pack.file_bytes))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pack_that_is_in_use_is_tried_again_without_a_change_and_one_that_is_done_is_not() {
+        let (start, settle) = (Instant::now(), Duration::from_secs(1));
+        let is_due = |state, after| {
+            let seen = Seen { files: Vec::new(), made: None, trouble: None };
+            Asset { seen, since: start, state }.is_due(start + after, settle)
+        };
+        assert_eq!([0, 1].map(|s| is_due(State::Waiting, Duration::from_secs(s))), [false, true]);
+        assert_eq!([1, 5].map(|s| is_due(State::InUse(start), Duration::from_secs(s))), [false, true]);
+        assert!(!is_due(State::Done, Duration::from_secs(100)));
+    }
 }

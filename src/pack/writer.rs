@@ -8,7 +8,9 @@ use rayon::prelude::*;
 use tempfile::NamedTempFile;
 use volpack_format::tables_digest;
 
-use crate::atomic_file::{LEFT_BEHIND, folder_of, is_temporary, make_readable};
+use crate::atomic_file::{
+    FileError, LEFT_BEHIND, folder_of, is_temporary, make_readable, of_any_length, replace,
+};
 
 use super::layout::{ALIGNMENT, Chunk, Header, MAGIC, Section, VERSION, encoding};
 
@@ -244,7 +246,7 @@ fn beside(path: &Path) -> io::Result<NamedTempFile> {
     let folder = folder_of(path);
     std::fs::create_dir_all(folder)?;
     remove_left_behind(folder);
-    tempfile::Builder::new().prefix(PREFIX).tempfile_in(folder)
+    tempfile::Builder::new().prefix(PREFIX).tempfile_in(of_any_length(folder))
 }
 
 /// What the names of unfinished packs begin with.
@@ -291,8 +293,8 @@ impl FinishedPack {
     /// Moves it to its place, in one step over whatever was there.
     ///
     /// # Errors
-    /// When it cannot be renamed.
-    pub fn persist(self) -> io::Result<()> {
-        self.file.persist(&self.path).map(drop).map_err(|e| e.error)
+    /// When it cannot be renamed, such as over a pack that another program has open on Windows.
+    pub fn persist(self) -> Result<(), FileError> {
+        replace(self.file, &self.path)
     }
 }

@@ -8,10 +8,12 @@ mod job;
 mod memory;
 mod reuse;
 
+use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
+use crate::atomic_file::is_in_use;
 use crate::cache::Cache;
 use crate::error::{Error, Result};
 use crate::pack::{FinishedPack, Grid, Pack, Provenance, Source};
@@ -127,7 +129,7 @@ fn build_cached(
     // A mapped file cannot be renamed everywhere.
     drop(pack);
     if verification.as_ref().is_none_or(|report| report.ok) {
-        finished.map_or(Ok(()), FinishedPack::persist).map_err(Error::io(&job.output))?;
+        finished.map_or(Ok(()), FinishedPack::persist)?;
     }
     let uses = cache.map(|cache| cache.take_uses()).unwrap_or_default();
     let seconds = clock.laps;
@@ -262,10 +264,8 @@ fn check_output(job: &Job) -> Result<()> {
             job.output.display()
         )));
     }
-    let mut magic = [0; 8];
-    let is_pack =
-        std::fs::File::open(&output).and_then(|mut f| std::io::Read::read_exact(&mut f, &mut magic)).is_ok()
-            && magic == crate::pack::layout::MAGIC;
+    // Windows does not open folders.
+    let is_pack = !output.is_dir() && is_pack(&output).map_err(|e| cannot_be_read(job, &e))?;
     if !is_pack {
         return Err(Error::Usage(format!(
             "{} exists and is not a pack: delete it, or choose another output",
@@ -273,6 +273,22 @@ fn check_output(job: &Job) -> Result<()> {
         )));
     }
     Ok(())
+}
+
+/// Whether a file begins as packs do.
+fn is_pack(path: &Path) -> std::io::Result<bool> {
+    let mut magic = Vec::new();
+    std::fs::File::open(path)?.take(crate::pack::layout::MAGIC.len() as u64).read_to_end(&mut magic)?;
+    Ok(magic == crate::pack::layout::MAGIC)
+}
+
+/// An output of which nobody can tell whether it is a pack is not replaced.
+fn cannot_be_read(job: &Job, error: &std::io::Error) -> Error {
+    if is_in_use(error) {
+        return Error::InUse(job.output.clone());
+    }
+    let why = format!("the output exists and cannot be read, so it is not replaced: {error}");
+    Error::io(&job.output)(std::io::Error::new(error.kind(), why))
 }
 
 /// Compares a pack's voxels, and pictures where settings for them are given, with its sources.

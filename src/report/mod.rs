@@ -25,6 +25,7 @@ pub use pack::{CodecSummary, PackSummary};
 pub use pages::{PageError, html, junit, markdown};
 pub use vdb::{GridSummary, TopologySummary, ValueSummary, VdbSummary};
 
+use crate::file_name::portable;
 use crate::pack::{Pack, Provenance};
 use crate::settings::Budget;
 use crate::verify::VerifyReport;
@@ -45,6 +46,8 @@ pub struct Reported<'a> {
     pub provenance: &'a Provenance,
     /// Its file.
     pub file: &'a Path,
+    /// The folder from which on the report names it: the manifest's.
+    pub base: &'a Path,
     /// BLAKE3 of the file.
     pub digest: blake3::Hash,
     /// Its sizes and counts.
@@ -84,7 +87,7 @@ impl Reported<'_> {
         let mut settings = serde_json::to_value(&provenance.settings).unwrap_or_default();
         settings["quality"] = provenance.settings.quality().to_string().into();
         let report = PackReport {
-            file: self.file.display().to_string(),
+            file: portable(self.file.strip_prefix(self.base).unwrap_or(self.file)),
             change: baseline.map(|old| figures.change_from(old)),
             frames: frames::costs(pack, self.found.as_ref()),
             figures,

@@ -94,7 +94,7 @@ pub struct AssetReport {
 /// One asset's pack.
 #[derive(Clone, Debug, Serialize, JsonSchema)]
 pub struct PackReport {
-    /// The file.
+    /// The file, relative to the manifest if it lies in its folder. Paths have slashes on every system.
     pub file: String,
     /// What people look at first.
     pub figures: Figures,

@@ -13,6 +13,7 @@ use super::{Reading, Sources, not_packable};
 use crate::cancel::CancelToken;
 use crate::component::find_packed;
 use crate::error::{Error, Result};
+use crate::file_name::check_name;
 use crate::pack::{Grid, Pack};
 use crate::render::{
     DecodedFrame, Device, Difference, Image, Mode, Renderer, Scene, TraceError, View, apart, difference,
@@ -203,7 +204,7 @@ fn compare_grid(
         }
         let (a, b) = (of_source.to_rgb8(scene.mode), of_pack.to_rgb8(scene.mode));
         if let Some(folder) = &settings.images {
-            let name = format!("{}-{:04}.png", file_name(&grid.name), grid.frames[f].record.number);
+            let name = file_name(&grid.name, grid.frames[f].record.number);
             write_side_by_side(&folder.join(name), &a, &b)?;
         }
         let picture = PictureReport {
@@ -368,9 +369,13 @@ fn tracer_difference(
     })
 }
 
-/// A grid's name without what file systems do not take.
-fn file_name(grid: &str) -> String {
-    grid.chars().map(|c| if c.is_alphanumeric() || "._-".contains(c) { c } else { '_' }).collect()
+/// The name of a picture: its grid's, without what file systems do not take, and its frame's number.
+fn file_name(grid: &str, frame: i32) -> String {
+    let grid: String =
+        grid.chars().map(|c| if c.is_alphanumeric() || "._-".contains(c) { c } else { '_' }).collect();
+    let name = format!("{grid}-{frame:04}.png");
+    // A grid `nul.x`, which nobody can rename who has only its file.
+    if check_name(&name).is_ok() { name } else { format!("_{name}") }
 }
 
 /// How much the difference is brightened.
@@ -392,4 +397,17 @@ fn write_side_by_side(path: &Path, source: &[u8], pack: &[u8]) -> Result<()> {
     }
     let file = std::fs::File::create(path).map_err(Error::io(path))?;
     write_png(std::io::BufWriter::new(file), [3 * SIDE, SIDE], &out).map_err(Error::io(path))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pictures_have_names_that_every_system_takes() {
+        assert_eq!(file_name("density", 7), "density-0007.png");
+        assert_eq!(file_name("a/b:c", -1), "a_b_c--001.png");
+        assert_eq!(file_name("nul", 7), "nul-0007.png");
+        assert_eq!(file_name("nul.x", 7), "_nul.x-0007.png");
+    }
 }
