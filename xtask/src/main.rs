@@ -1,4 +1,4 @@
-//! Tasks for developers of volpack: benchmarks, comparison with OpenVDB, mutation runs.
+//! Tasks for developers of volpack: benchmarks, comparison with OpenVDB, mutation runs, the build for Windows.
 //!
 //! `cargo run --release -p xtask -- help` lists the tasks. They are not part of the tests, because they need
 //! packages of Debian (`libopenvdb-dev libboost-dev libtbb-dev libimath-dev g++`) or your own volumes.
@@ -24,6 +24,8 @@ mod stress;
 mod sweep;
 mod trace;
 mod wasm;
+mod windows;
+mod wine;
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -62,6 +64,8 @@ enum Task {
     StressCache(stress::Args),
     /// Read the conformance packs in WebAssembly under node, and compare with the same read natively
     Wasm,
+    /// Cross-build volpack.exe on Linux with MinGW, and check that it needs only DLLs of Windows
+    Windows(windows::Args),
     /// Read files and print the time (`bench read` runs this)
     #[command(hide = true)]
     ReadOnce(read::OnceArgs),
@@ -119,6 +123,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         Task::StressCache(args) => stress::run(&args),
         Task::Mutate(args) => mutate::run(args),
         Task::Wasm => wasm::check(),
+        Task::Windows(args) => windows::run(&args),
         Task::ReadOnce(args) => read::once(&args),
     }
 }
