@@ -99,9 +99,16 @@ impl Prefix {
 
 impl Drop for Prefix {
     fn drop(&mut self) {
-        // Otherwise the processes that serve the prefix write into it while it is removed. The folder is temporary, so a failure
-        // does no harm.
+        // Otherwise the processes that serve the prefix write into it while it is removed, and complain. The folder is temporary, so
+        // a failure does no harm.
         let _ = self.wine().args(["wineboot", "--kill"]).output();
+        for server in ["wineserver", "/usr/lib/wine/wineserver"] {
+            let mut wait = Command::new(server);
+            self.set_environment(&mut wait);
+            if wait.arg("--wait").output().is_ok() {
+                break;
+            }
+        }
     }
 }
 
