@@ -100,9 +100,9 @@ impl Toolchain {
 
 /// Fills a folder with the libraries to link, and returns it.
 ///
-/// These are the kernels of `intel_tex_2`, which has them for MSVC only: the linker reads those too, under the names that its
-/// build script asks for. The others are MinGW's own as static libraries, without the import libraries beside them that the
-/// linker prefers: a program that is one file cannot miss a DLL.
+/// The kernels of `intel_tex_2` exist for MSVC only. MinGW's linker reads them too, under the names that the crate's build script asks
+/// for. The C++ library is MinGW's own, without the import library beside it, which the linker would prefer: then the program would
+/// need MinGW's DLLs.
 fn collect_libraries(toolchain: &Toolchain) -> Result<PathBuf> {
     let folder = target_folder()?.join("windows-libs");
     fs::create_dir_all(&folder)?;
@@ -114,10 +114,8 @@ fn collect_libraries(toolchain: &Toolchain) -> Result<PathBuf> {
     ] {
         copy(&kernels.join(from), &folder.join(to))?;
     }
-    for name in ["libstdc++.a", "libgcc_eh.a", "libwinpthread.a"] {
-        let found = output(Command::new(&toolchain.cxx).arg(format!("-print-file-name={name}")))?;
-        copy(Path::new(found.trim()), &folder.join(name))?;
-    }
+    let found = output(Command::new(&toolchain.cxx).arg("-print-file-name=libstdc++.a"))?;
+    copy(Path::new(found.trim()), &folder.join("libstdc++.a"))?;
     Ok(folder)
 }
 

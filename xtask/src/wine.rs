@@ -63,9 +63,14 @@ impl Prefix {
         fs::write(&source, BCRYPTPRIMITIVES)?;
         let dll = source.with_extension("dll");
         succeed(Command::new(cc).arg("-shared").arg(&source).arg("-o").arg(&dll).arg("-ladvapi32"))?;
-        let mut boot = Command::new(&prefix.wine);
-        prefix.set_environment(&mut boot);
-        output(boot.args(["wineboot", "--init"]))?;
+        output(prefix.wine().args(["wineboot", "--init"]))?;
+        // On the drive of the repository, because tests name its files by paths without a drive. Wine takes these two variables from
+        // its registry only.
+        let temporary = dos_path(prefix.folder.path());
+        for variable in ["TEMP", "TMP"] {
+            let add = ["reg", "add", r"HKCU\Environment", "/v", variable, "/d", &temporary, "/f"];
+            output(prefix.wine().args(add))?;
+        }
         Ok(prefix)
     }
 
@@ -74,12 +79,18 @@ impl Prefix {
         &self.wine
     }
 
+    fn wine(&self) -> Command {
+        let mut command = Command::new(&self.wine);
+        self.set_environment(&mut command);
+        command
+    }
+
     /// Makes a process, and those that it starts, run wine in this folder.
     pub fn set_environment(&self, command: &mut Command) {
         let folder = self.folder.path();
         command
             .env("WINEPREFIX", folder.join("prefix"))
-            .env("WINEPATH", format!("Z:{}", folder.display()).replace('/', "\\"))
+            .env("WINEPATH", dos_path(folder))
             .env("WINEDEBUG", "-all")
             // Otherwise a new prefix asks for .NET and a browser to be installed.
             .env("WINEDLLOVERRIDES", "mscoree,mshtml=");
@@ -88,12 +99,22 @@ impl Prefix {
 
 impl Drop for Prefix {
     fn drop(&mut self) {
-        // Otherwise the processes that serve the prefix write into it while it is removed. The folder is temporary, so a failure
-        // does no harm.
-        let mut end = Command::new(&self.wine);
-        self.set_environment(&mut end);
-        let _ = end.args(["wineboot", "--kill"]).output();
+        // Otherwise the processes that serve the prefix write into it while it is removed, and complain. The folder is temporary, so
+        // a failure does no harm.
+        let _ = self.wine().args(["wineboot", "--kill"]).output();
+        for server in ["wineserver", "/usr/lib/wine/wineserver"] {
+            let mut wait = Command::new(server);
+            self.set_environment(&mut wait);
+            if wait.arg("--wait").output().is_ok() {
+                break;
+            }
+        }
     }
+}
+
+/// The path under which programs of Windows see a file of Linux.
+fn dos_path(path: &Path) -> String {
+    format!("Z:{}", path.display()).replace('/', "\\")
 }
 
 /// Runs the program for Windows and the one for Linux on the fixtures, and compares.
@@ -161,8 +182,7 @@ impl<'a> Runner<'a> {
         let mut command = match self.wine {
             None => Command::new(&self.exe),
             Some(prefix) => {
-                let mut command = Command::new(&prefix.wine);
-                prefix.set_environment(&mut command);
+                let mut command = prefix.wine();
                 command.arg(&self.exe);
                 command
             }
