@@ -273,7 +273,11 @@ impl Total {
             gpu_bytes: sum(|figures| figures.gpu_bytes),
             file_bytes: sum(|figures| figures.file_bytes),
             source_bytes: sum(|figures| figures.source_bytes),
-            build_seconds: packs.iter().filter_map(|(_, figures)| figures.build_seconds).sum(),
+            // The sum of no floats is -0.
+            build_seconds: packs
+                .iter()
+                .filter_map(|(_, figures)| figures.build_seconds)
+                .fold(0.0, |a, b| a + b),
             gpu_budget: budget.gpu_size.map(|size| size.0),
             file_budget: budget.file_size.map(|size| size.0),
             seconds_budget: budget.build_seconds,

@@ -154,6 +154,7 @@ fn verdict(report: &Report) -> String {
     let packs = report.assets.iter().filter_map(|asset| asset.pack.as_ref());
     match packs.filter(|pack| !pack.figures.compared).count() {
         0 => "✓ Every pack was compared with its source and is within budget".to_owned(),
+        1 => "✓ Every pack is whole; 1 was not compared with its source".to_owned(),
         unknown => format!("✓ Every pack is whole; {unknown} were not compared with their sources"),
     }
 }
