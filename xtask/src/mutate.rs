@@ -249,5 +249,5 @@ fn child(batch: &str, seed: u64) -> Result<(), Box<dyn Error>> {
 }
 
 fn fixtures() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../fixtures")
+    crate::peer_programs::root().join("fixtures")
 }

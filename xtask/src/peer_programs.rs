@@ -1,4 +1,4 @@
-//! Compiles the small C++ and CUDA programs that run OpenVDB's and NanoVDB's code, and finds files of the repository.
+//! Compiles the small C++ and CUDA programs that run OpenVDB's and NanoVDB's code, and finds files and tools of the repository.
 
 use std::error::Error;
 use std::path::{Path, PathBuf};
@@ -7,6 +7,13 @@ use std::process::Command;
 /// The repository's root.
 pub fn root() -> &'static Path {
     Path::new(env!("CARGO_MANIFEST_DIR")).parent().expect("xtask lies in the repository")
+}
+
+/// The cargo that runs this task, in the repository's root.
+pub fn cargo() -> Command {
+    let mut cargo = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    cargo.current_dir(root());
+    cargo
 }
 
 /// Compiles a program against OpenVDB into `target/peers` and returns its path.

@@ -8,6 +8,7 @@ use std::process::Command;
 
 use serde_json::Value as Json;
 
+use crate::peer_programs;
 use crate::wine;
 
 type Result<T> = std::result::Result<T, Box<dyn Error>>;
@@ -83,11 +84,10 @@ impl Toolchain {
 
     /// Cargo with these programs for this target, and libraries from a folder.
     fn cargo(&self, libraries: &Path) -> Command {
-        let mut cargo = Command::new(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+        let mut cargo = peer_programs::cargo();
         let mut search = OsString::from("-Lnative=");
         search.push(libraries);
         cargo
-            .current_dir(root())
             .env("CARGO_TARGET_X86_64_PC_WINDOWS_GNU_LINKER", &self.cc)
             .env("CC_x86_64_pc_windows_gnu", &self.cc)
             .env("CXX_x86_64_pc_windows_gnu", &self.cxx)
@@ -174,14 +174,9 @@ fn is_system_dll(name: &str) -> bool {
     stem.starts_with("api-ms-win-") || SYSTEM.contains(&stem)
 }
 
-fn root() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("..")
-}
-
 fn metadata(arguments: &[&str]) -> Result<Json> {
-    let cargo = std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into());
-    let mut command = Command::new(cargo);
-    command.args(["metadata", "--format-version", "1"]).args(arguments).current_dir(root());
+    let mut command = peer_programs::cargo();
+    command.args(["metadata", "--format-version", "1"]).args(arguments);
     Ok(serde_json::from_str(&output(&mut command)?)?)
 }
 

@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 use serde_json::Value as Json;
 use volpack::report::VdbSummary;
 
+use crate::peer_programs::root;
 use crate::windows::{output, succeed};
 
 type Result<T> = std::result::Result<T, Box<dyn Error>>;
@@ -161,10 +162,9 @@ struct Runner<'a> {
 impl<'a> Runner<'a> {
     fn new(exe: PathBuf, wine: Option<&'a Prefix>) -> Result<Self> {
         let folder = tempfile::tempdir()?;
-        let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
-        fs::copy(root.join("pipeline.toml"), folder.path().join("pipeline.toml"))?;
+        fs::copy(root().join("pipeline.toml"), folder.path().join("pipeline.toml"))?;
         fs::create_dir(folder.path().join("fixtures"))?;
-        for entry in fs::read_dir(root.join("fixtures"))? {
+        for entry in fs::read_dir(root().join("fixtures"))? {
             let entry = entry?;
             if entry.path().extension() == Some(OsStr::new("vdb")) {
                 fs::copy(entry.path(), folder.path().join("fixtures").join(entry.file_name()))?;
