@@ -12,7 +12,7 @@ use volpack::cancel::CancelToken;
 use volpack::pack::Pack;
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::render::{
-    DecodedFrame, Device, Image, Interpolation, Mode, Scene, View, apart, spread, trace,
+    DecodedFrame, Device, Image, Interpolation, Mode, Scene, Up, View, apart, spread, trace,
     trace_noting_gpu_spread,
 };
 use volpack::settings::{Format, Quality, Settings};
@@ -138,7 +138,8 @@ fn what_is_below_zero_absorbs_nothing() {
             let scene =
                 Scene::new(&pack.grids()[0], 0, &"orbit:30,20,1".parse().unwrap(), Mode::Density, SIZE);
             // Their boxes differ, and with them what a camera around them would see.
-            let camera = volpack::render::Camera { eye: [5.0, 3.0, 4.0], target: [1.2; 3], fov: 30.0 };
+            let camera =
+                volpack::render::Camera { eye: [5.0, 3.0, 4.0], target: [1.2; 3], fov: 30.0, up: Up::Y };
             let scene = Scene { camera, extinction: 5.0, ..scene };
             if let Some(gpu) = gpu() {
                 let traced =

@@ -1,5 +1,7 @@
 //! Where pictures are taken from.
 
+use clap::ValueEnum;
+
 use super::traverse::{Ray, Real};
 use crate::pack::Grid;
 use crate::volume::CoordBox;
@@ -41,11 +43,47 @@ impl WorldBox {
 
     /// The length of its diagonal, in world units.
     pub fn diagonal(&self) -> f64 {
-        length(sub(self.max, self.min))
+        length(self.size())
+    }
+
+    fn size(&self) -> [f64; 3] {
+        sub(self.max, self.min)
     }
 
     fn middle(&self) -> [f64; 3] {
         std::array::from_fn(|a| f64::midpoint(self.min[a], self.max[a]))
+    }
+}
+
+/// The axis of world space that points up.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Up {
+    /// x
+    X,
+    /// y, as in Houdini
+    Y,
+    /// z, as in Blender
+    Z,
+}
+
+impl Up {
+    /// A guess from a box, since a pack does not say: what spreads and rises is about as wide as it is deep, so up is the
+    /// one of y and z across which the box is more nearly square; y where that is the same.
+    pub fn of_box(bounds: &WorldBox) -> Self {
+        let [x, y, z] = bounds.size();
+        let unlike = |a: f64, b: f64| a.max(b) / a.min(b);
+        // Where a side is 0 the comparison is false.
+        if unlike(x, y) < unlike(x, z) { Self::Z } else { Self::Y }
+    }
+
+    /// A direction given as right, up and towards the viewer in front, in world space. With z up the front is at -y, as in
+    /// Blender.
+    pub fn to_world(self, [right, up, front]: [f64; 3]) -> [f64; 3] {
+        match self {
+            Self::X => [up, right, -front],
+            Self::Y => [right, up, front],
+            Self::Z => [right, -front, up],
+        }
     }
 }
 
@@ -58,29 +96,46 @@ pub struct Camera {
     pub target: [f64; 3],
     /// The vertical angle of view in degrees.
     pub fov: f64,
+    /// What is up in the picture.
+    pub up: Up,
 }
 
 /// How a camera is asked for.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum View {
-    /// Around the middle of the volume's box: azimuth and elevation in degrees, and distance in
-    /// diagonals of the box.
-    Orbit([f64; 3]),
-    /// A camera in world space.
-    Fixed(Camera),
+    /// Around the middle of the volume's box.
+    Orbit {
+        /// In degrees: 0 is in front, 90 to the right.
+        azimuth: f64,
+        /// In degrees: 90 is above.
+        elevation: f64,
+        /// In diagonals of the box; without one as near as shows all of the box.
+        distance: Option<f64>,
+    },
+    /// A camera in world space: the eye, what it looks at, and the vertical angle of view in degrees.
+    Fixed {
+        /// See [`Camera::eye`].
+        eye: [f64; 3],
+        /// See [`Camera::target`].
+        target: [f64; 3],
+        /// See [`Camera::fov`].
+        fov: f64,
+    },
 }
 
 impl Default for View {
     /// From ahead, above and to the side, one and a quarter diagonals away, with all of the box in
     /// view.
     fn default() -> Self {
-        Self::Orbit([40.0, 20.0, 1.25])
+        Self::Orbit { azimuth: 40.0, elevation: 20.0, distance: Some(1.25) }
     }
 }
 
 /// A view that cannot be parsed.
 #[derive(Debug, thiserror::Error)]
-#[error("{0:?} is not a camera: orbit:AZIMUTH,ELEVATION,DISTANCE or X,Y,Z;X,Y,Z;FOV (eye; target; degrees)")]
+#[error(
+    "{0:?} is not a camera: orbit:AZIMUTH,ELEVATION[,DISTANCE] or X,Y,Z;X,Y,Z;FOV (eye; target; degrees)"
+)]
 pub struct CameraError(String);
 
 impl std::str::FromStr for View {
@@ -88,38 +143,90 @@ impl std::str::FromStr for View {
 
     fn from_str(text: &str) -> Result<Self, CameraError> {
         let error = || CameraError(text.to_owned());
-        let numbers = |text: &str| -> Option<[f64; 3]> {
+        let numbers = |text: &str| -> Option<Vec<f64>> {
             let numbers: Vec<f64> = text.split(',').map(|v| v.trim().parse().ok()).collect::<Option<_>>()?;
-            numbers.try_into().ok().filter(|n: &[f64; 3]| n.iter().all(|v| v.is_finite()))
+            numbers.iter().all(|v| v.is_finite()).then_some(numbers)
         };
         if let Some(orbit) = text.strip_prefix("orbit:") {
-            return numbers(orbit).filter(|o| o[2] > 0.0).map(View::Orbit).ok_or_else(error);
+            return match numbers(orbit).as_deref() {
+                Some(&[azimuth, elevation]) => Ok(Self::Orbit { azimuth, elevation, distance: None }),
+                Some(&[azimuth, elevation, distance]) if distance > 0.0 => {
+                    Ok(Self::Orbit { azimuth, elevation, distance: Some(distance) })
+                }
+                _ => Err(error()),
+            };
         }
+        let place = |text: &str| -> Option<[f64; 3]> { numbers(text)?.try_into().ok() };
         let parts: Vec<&str> = text.split(';').collect();
         let [eye, target, fov] = parts[..] else { return Err(error()) };
         let fov = fov.trim().parse().ok().filter(|f| (1.0..170.0).contains(f)).ok_or_else(error)?;
-        let (eye, target) = numbers(eye).zip(numbers(target)).filter(|(e, t)| e != t).ok_or_else(error)?;
-        Ok(View::Fixed(Camera { eye, target, fov }))
+        let (eye, target) = place(eye).zip(place(target)).filter(|(e, t)| e != t).ok_or_else(error)?;
+        Ok(View::Fixed { eye, target, fov })
     }
 }
 
 /// The vertical angle of view of an orbit.
 const FOV: f64 = 45.0;
 
+/// How much of a picture's half the farthest corner of a fitted box leaves free.
+const MARGIN: f64 = 0.04;
+
 impl View {
-    /// The camera for a box. Of a box of no size it is a world unit away.
-    pub fn camera(&self, bounds: &WorldBox) -> Camera {
-        let [azimuth, elevation, distance] = match *self {
-            Self::Fixed(camera) => return camera,
-            Self::Orbit(orbit) => orbit,
+    /// The camera for a box, in pictures of a size. Of a box of no size it is a world unit away.
+    pub fn camera(&self, bounds: &WorldBox, up: Up, size: [u32; 2]) -> Camera {
+        let (azimuth, elevation, distance) = match *self {
+            Self::Fixed { eye, target, fov } => return Camera { eye, target, fov, up },
+            Self::Orbit { azimuth, elevation, distance } => (azimuth, elevation, distance),
         };
         let target = bounds.middle();
-        let diagonal = bounds.diagonal();
-        let distance = distance * if diagonal > 0.0 { diagonal } else { 1.0 };
-        let (azimuth, elevation) = (azimuth.to_radians(), elevation.to_radians());
-        let direction = [azimuth.sin() * elevation.cos(), elevation.sin(), azimuth.cos() * elevation.cos()];
-        Camera { eye: std::array::from_fn(|a| target[a] + direction[a] * distance), target, fov: FOV }
+        let back = up.to_world(direction(azimuth, elevation));
+        let at = |distance: f64| {
+            let distance = if distance > 0.0 { distance } else { 1.0 };
+            Camera { eye: std::array::from_fn(|a| target[a] + back[a] * distance), target, fov: FOV, up }
+        };
+        let Some(diagonals) = distance else {
+            return at(fitting_distance(bounds, at(1.0).axes(), half_size(FOV, size)));
+        };
+        at(diagonals * bounds.diagonal())
     }
+}
+
+/// How far from its middle a box is seen whole, along the axes right, up and forward.
+fn fitting_distance(bounds: &WorldBox, axes: [[f64; 3]; 3], half_size: [f64; 2]) -> f64 {
+    let half = bounds.size().map(|s| s / 2.0);
+    let corners =
+        (0..8).map(|i: u32| std::array::from_fn(|a| if i >> a & 1 == 1 { half[a] } else { -half[a] }));
+    let distance = |corner: [f64; 3]| {
+        let [right, up, forward] = axes.map(|axis| dot(axis, corner));
+        let [width, height] = half_size.map(|s| s * (1.0 - MARGIN));
+        (right.abs() / width).max(up.abs() / height) - forward
+    };
+    corners.map(distance).fold(0.0, f64::max)
+}
+
+/// Half the width and the height of a picture, a unit away.
+fn half_size(fov: f64, size: [u32; 2]) -> [f64; 2] {
+    let height = (fov.to_radians() / 2.0).tan();
+    [height * f64::from(size[0]) / f64::from(size[1]), height]
+}
+
+impl Camera {
+    /// Right, up and forward, in world space.
+    fn axes(&self) -> [[f64; 3]; 3] {
+        let forward = normalise(sub(self.target, self.eye));
+        let upwards = self.up.to_world([0.0, 1.0, 0.0]);
+        // Straight up or down has no up of its own.
+        let is_vertical = dot(forward, upwards).abs() > 0.999;
+        let upwards = if is_vertical { self.up.to_world([0.0, 0.0, 1.0]) } else { upwards };
+        let right = normalise(cross(forward, upwards));
+        [right, cross(right, forward), forward]
+    }
+}
+
+/// The direction of an azimuth and an elevation in degrees: right, up, front.
+pub fn direction(azimuth: f64, elevation: f64) -> [f64; 3] {
+    let (azimuth, elevation) = (azimuth.to_radians(), elevation.to_radians());
+    [azimuth.sin() * elevation.cos(), elevation.sin(), azimuth.cos() * elevation.cos()]
 }
 
 /// Rays of a picture in cell space: `t` is distance in world units.
@@ -144,13 +251,8 @@ impl Lens {
     /// the matrix cannot be inverted.
     pub fn new(camera: &Camera, matrix: &[f64; 16], size: [u32; 2], shift: [f64; 3]) -> Option<Self> {
         let inverse = invert3(matrix)?;
-        let forward = normalise(sub(camera.target, camera.eye));
-        // Straight up or down has no up of its own.
-        let world_up = if forward[1].abs() > 0.999 { [0.0, 0.0, 1.0] } else { [0.0, 1.0, 0.0] };
-        let right = normalise(cross(forward, world_up));
-        let up = cross(right, forward);
-        let half_height = (camera.fov.to_radians() / 2.0).tan();
-        let half_width = half_height * f64::from(size[0]) / f64::from(size[1]);
+        let [right, up, forward] = camera.axes();
+        let [half_width, half_height] = half_size(camera.fov, size);
         let translation = [matrix[12], matrix[13], matrix[14]];
         let to_cell = |v: [f64; 3]| apply3(&inverse, v);
         Some(Self {
@@ -225,10 +327,20 @@ mod tests {
 
     #[test]
     fn views_are_parsed() {
-        assert_eq!("orbit:10,20,1.5".parse::<View>().unwrap(), View::Orbit([10.0, 20.0, 1.5]));
-        let fixed = Camera { eye: [1.0, 2.0, 3.0], target: [0.0; 3], fov: 45.0 };
-        assert_eq!("1,2,3;0,0,0;45".parse::<View>().unwrap(), View::Fixed(fixed));
-        for bad in ["", "orbit:1,2", "orbit:1,2,0", "1,2,3;1,2,3;45", "1,2,3;0,0,0;0", "1,2,x;0,0,0;45"] {
+        let orbit = |distance| View::Orbit { azimuth: 10.0, elevation: 20.0, distance };
+        assert_eq!("orbit:10,20,1.5".parse::<View>().unwrap(), orbit(Some(1.5)));
+        assert_eq!("orbit:10,20".parse::<View>().unwrap(), orbit(None));
+        let fixed = View::Fixed { eye: [1.0, 2.0, 3.0], target: [0.0; 3], fov: 45.0 };
+        assert_eq!("1,2,3;0,0,0;45".parse::<View>().unwrap(), fixed);
+        for bad in [
+            "",
+            "orbit:1",
+            "orbit:1,2,0",
+            "orbit:1,2,3,4",
+            "1,2,3;1,2,3;45",
+            "1,2,3;0,0,0;0",
+            "1,2,x;0,0,0;45",
+        ] {
             assert!(bad.parse::<View>().is_err(), "{bad}");
         }
     }
@@ -238,12 +350,51 @@ mod tests {
         // A rotated, sheared and moved grid.
         let m = [0.7, 0.1, -0.7, 0.0, 0.0, 2.0, 0.3, 0.0, 0.7, 0.0, 0.7, 0.0, 5.0, -3.0, 1.0, 1.0];
         let voxels = CoordBox::cube(crate::volume::Coord::new(-8, 0, 16), 32);
-        let camera = View::default().camera(&WorldBox::around([(voxels, &m)]));
+        let camera = View::default().camera(&WorldBox::around([(voxels, &m)]), Up::Y, [64, 32]);
         let lens = Lens::new(&camera, &m, [64, 32], [0.0; 3]).unwrap();
         let ray = lens.ray::<f64>(0.0, 0.0);
         let t = length(sub(camera.target, camera.eye));
         for (a, middle) in [7.5, 15.5, 31.5].into_iter().enumerate() {
             assert!((ray.origin[a] + ray.direction[a] * t - middle).abs() < 1e-9);
+        }
+    }
+
+    #[test]
+    fn a_fitted_box_fills_the_picture_and_no_more() {
+        let bounds = WorldBox { min: [-1.0, 2.0, 5.0], max: [3.0, 3.0, 11.0] };
+        for (size, view) in
+            [([64, 64], "orbit:40,20"), ([160, 90], "orbit:-100,-60"), ([30, 90], "orbit:0,90")]
+        {
+            let camera = view.parse::<View>().unwrap().camera(&bounds, Up::Z, size);
+            let [right, up, forward] = camera.axes();
+            let [width, height] = half_size(camera.fov, size);
+            let reach = (0..8).map(|i: u32| {
+                let end = |a: usize| if i >> a & 1 == 1 { bounds.max[a] } else { bounds.min[a] };
+                let corner = sub(std::array::from_fn(end), camera.eye);
+                let ahead = dot(corner, forward);
+                (dot(corner, right).abs() / width).max(dot(corner, up).abs() / height) / ahead
+            });
+            let farthest = reach.fold(0.0, f64::max);
+            assert!((farthest - (1.0 - MARGIN)).abs() < 1e-9, "{view}: {farthest}");
+        }
+    }
+
+    #[test]
+    fn up_is_guessed_from_the_shape() {
+        let of = |size: [f64; 3]| Up::of_box(&WorldBox { min: [0.0; 3], max: size });
+        // A column of smoke by Blender and one by Houdini, a flat cloud, a cube, a sheet, nothing.
+        assert_eq!(of([94.0, 94.0, 190.0]), Up::Z);
+        assert_eq!(of([111.0, 222.0, 112.0]), Up::Y);
+        assert_eq!(of([126.0, 86.0, 154.0]), Up::Y);
+        assert_eq!(of([8.0; 3]), Up::Y);
+        assert_eq!([of([8.0, 0.0, 8.0]), of([8.0, 8.0, 0.0]), of([0.0; 3])], [Up::Y, Up::Z, Up::Y]);
+    }
+
+    #[test]
+    fn whatever_is_up_the_axes_are_a_right_handed_frame() {
+        for up in [Up::X, Up::Y, Up::Z] {
+            let [r, u, f] = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]].map(|axis| up.to_world(axis));
+            assert_eq!(cross(r, u), f, "{up:?}");
         }
     }
 }

@@ -36,6 +36,12 @@ enum Cell {
     Node(Box<[u32; NODE_CHILDREN]>, Vec<Constant>),
 }
 
+/// The 128³ that was looked up last. A ray stays in one for long, and to find one takes a hash.
+#[derive(Clone, Copy, Default)]
+pub struct Nearby<'a> {
+    last: Option<(Coord, Option<&'a Cell>)>,
+}
+
 /// How far apart GPUs interpolate, of the distance of a block's endpoints.
 const GPU_UNCERTAINTY: f32 = 0.03;
 
@@ -228,10 +234,10 @@ impl DecodedFrame {
     }
 
     /// The node around a voxel.
-    pub fn find(&self, at: Coord) -> Found<'_> {
+    pub fn find<'a>(&'a self, at: Coord, nearby: &mut Nearby<'a>) -> Found<'a> {
         let found = |content, dim: i32| Found { content, origin: at.align_down(dim), dim };
         let background = Content::Constant(Constant { value: self.background, active: false });
-        match self.cells.get(&at.align_down(L2_DIM)) {
+        match self.cell(at, nearby) {
             None => match self.roots.get(&at.align_down(L1_DIM)) {
                 Some(root) => found(Content::Constant(*root), L1_DIM),
                 None => found(background, L2_DIM),
@@ -248,11 +254,19 @@ impl DecodedFrame {
         }
     }
 
+    fn cell<'a>(&'a self, at: Coord, nearby: &mut Nearby<'a>) -> Option<&'a Cell> {
+        let place = at.align_down(L2_DIM);
+        match nearby.last {
+            Some((last, cell)) if last == place => cell,
+            _ => nearby.last.insert((place, self.cells.get(&place))).1,
+        }
+    }
+
     /// Whether the region of a voxel and the seven next to it on its high sides are background, all of
     /// them in one L2 node: then no cell of that region has a corner that is not.
-    pub fn is_alone(&self, at: Coord) -> bool {
+    pub fn is_alone<'a>(&'a self, at: Coord, nearby: &mut Nearby<'a>) -> bool {
         let region = |axis: usize| at.0[axis].rem_euclid(L2_DIM) / BRICK_DIM;
-        let Some(Cell::Node(places, _)) = self.cells.get(&at.align_down(L2_DIM)) else { return false };
+        let Some(Cell::Node(places, _)) = self.cell(at, nearby) else { return false };
         let last = L2_DIM / BRICK_DIM - 1;
         (0..3).all(|axis| region(axis) < last)
             && (0..8).all(|corner| {

@@ -9,7 +9,7 @@ use bytemuck::Pod;
 use wgpu::util::DeviceExt;
 
 use self::params::Params;
-use self::pipelines::{Has, Pipelines, WORKGROUP};
+use self::pipelines::{Has, LIGHT_WORKGROUP, Pipelines, WORKGROUP};
 use super::image::Image;
 use super::scene::Scene;
 use crate::codec::{Codec, TextureFormat};
@@ -18,9 +18,14 @@ use crate::volume::CoordBox;
 
 pub use super::gpu_error::GpuError;
 
-/// `volpack.wgsl` and `hdda.wgsl`, what an engine takes over.
-pub const VOLPACK_WGSL: &str =
-    concat!(include_str!("shaders/volpack.wgsl"), "\n", include_str!("shaders/hdda.wgsl"));
+/// `volpack.wgsl`, `hdda.wgsl` and `march.wgsl`, what an engine takes over.
+pub const VOLPACK_WGSL: &str = concat!(
+    include_str!("shaders/volpack.wgsl"),
+    "\n",
+    include_str!("shaders/hdda.wgsl"),
+    "\n",
+    include_str!("shaders/march.wgsl")
+);
 /// `tracer.wgsl`, which goes with it.
 pub const TRACER_WGSL: &str = include_str!("shaders/tracer.wgsl");
 
@@ -219,9 +224,10 @@ impl Gpu {
                 what: format!("cannot write a picture of {width} × {height}"),
             });
         }
+        let asked = Params::new(scene, [grid, frame], voxels)?;
         let params = self.device.create_buffer_init(&wgpu::util::BufferInitDescriptor {
             label: Some("params"),
-            contents: bytemuck::bytes_of(&Params::new(scene, [grid, frame], voxels)?),
+            contents: bytemuck::bytes_of(&asked),
             usage: wgpu::BufferUsages::UNIFORM,
         });
         let buffer = |size, usage| {
@@ -234,8 +240,11 @@ impl Gpu {
         };
         let output = buffer(bytes, wgpu::BufferUsages::STORAGE | wgpu::BufferUsages::COPY_SRC);
         let readback = buffer(bytes, wgpu::BufferUsages::MAP_READ | wgpu::BufferUsages::COPY_DST);
-        let group = self.bind(uploaded, &params, &output);
-        let pipeline = self.pipelines.get(&self.device, uploaded.has, scene);
+        let drawing = self.pipelines.get(&self.device, uploaded.has, scene);
+        // A buffer cannot be empty.
+        let lights = if drawing.light.is_some() { asked.light_points() } else { 1 };
+        let light = buffer(u64::from(lights) * 4, wgpu::BufferUsages::STORAGE);
+        let group = self.bind(uploaded, [&params, &uploaded.tree, &output, &light]);
 
         let mut milliseconds = Vec::new();
         for repeat in 0..repeats {
@@ -250,8 +259,12 @@ impl Gpu {
                         end_of_pass_write_index: Some(1),
                     }),
                 });
-                pass.set_pipeline(&pipeline);
                 pass.set_bind_group(0, &group, &[]);
+                if let Some(pipeline) = &drawing.light {
+                    pass.set_pipeline(pipeline);
+                    pass.dispatch_workgroups(lights.div_ceil(LIGHT_WORKGROUP), 1, 1);
+                }
+                pass.set_pipeline(&drawing.trace);
                 let [across, down] = WORKGROUP;
                 pass.dispatch_workgroups(width.div_ceil(across), height.div_ceil(down), 1);
             }
@@ -272,8 +285,8 @@ impl Gpu {
         Ok((Image { size: scene.size, pixels: self.read(&readback)? }, milliseconds))
     }
 
-    fn bind(&self, uploaded: &Uploaded, params: &wgpu::Buffer, output: &wgpu::Buffer) -> wgpu::BindGroup {
-        let buffers = [params, &uploaded.tree, output].map(wgpu::Buffer::as_entire_binding);
+    fn bind(&self, uploaded: &Uploaded, buffers: [&wgpu::Buffer; 4]) -> wgpu::BindGroup {
+        let buffers = buffers.map(wgpu::Buffer::as_entire_binding);
         let textures = uploaded.textures.iter().map(wgpu::BindingResource::TextureView);
         let entries: Vec<_> = buffers
             .into_iter()

@@ -3,6 +3,7 @@
 use std::io::{self, Write};
 
 use super::Mode;
+use super::scene::Scene;
 use super::traverse::Real;
 
 /// A traced picture.
@@ -15,22 +16,23 @@ pub struct Image {
 }
 
 /// What lies behind the volume.
-const BACKDROP: [f32; 3] = [0.055, 0.07, 0.10];
+pub const BACKDROP: [f32; 3] = [0.055, 0.07, 0.10];
 
 impl Image {
     /// As 8-bit RGB for people. Depths and steps are scaled to the picture's own range.
-    pub fn to_rgb8(&self, mode: Mode) -> Vec<u8> {
+    pub fn to_rgb8(&self, scene: &Scene) -> Vec<u8> {
         let values = || self.pixels.iter().map(|p| p[0]);
         let largest = values().fold(0.0, f32::max).max(1e-30);
         let nearest = values().filter(|v| *v >= 0.0).fold(f32::INFINITY, f32::min);
         let color = |p: &[f32; 4]| -> [f32; 3] {
-            match mode {
+            match scene.mode {
                 Mode::Density => std::array::from_fn(|c| BACKDROP[c] * (1.0 - p[0]) + p[c] * 0.95),
                 Mode::Depth if p[0] < 0.0 => BACKDROP,
                 Mode::Depth => [1.0 - 0.9 * (p[0] - nearest) / (largest - nearest).max(1e-30); 3],
                 Mode::Steps => heat(p[0] / largest),
                 Mode::First => [p[0] / largest; 3],
                 _ if p[..3] == [0.0; 3] => BACKDROP,
+                Mode::Lit if !scene.level_set => [p[0], p[1], p[2]].map(shoulder),
                 _ => [p[0], p[1], p[2]],
             }
         };
@@ -72,6 +74,15 @@ pub fn apart(a: &[f32], b: &[f32]) -> f32 {
     a.iter().zip(b).map(apart).fold(0.0, f32::max)
 }
 
+/// Where bright light begins to be compressed.
+const SHOULDER: f32 = 0.7;
+
+/// Light as it is shown: what is bright nears 1 and never reaches it, so that a fire does not turn into a white spot.
+fn shoulder(v: f32) -> f32 {
+    let over = (v - SHOULDER).max(0.0) / (1.0 - SHOULDER);
+    v.min(SHOULDER) + (1.0 - SHOULDER) * (over / (1.0 + over))
+}
+
 fn to_srgb8(v: f32) -> u8 {
     let v = v.clamp(0.0, 1.0);
     let s = if v <= 0.003_130_8 { v * 12.92 } else { 1.055 * v.powf(1.0 / 2.4) - 0.055 };
@@ -107,7 +118,7 @@ pub fn write_png(out: impl Write, size: [u32; 2], rgb: &[u8]) -> io::Result<()> 
 ///
 /// # Errors
 /// When `out` cannot be written.
-pub fn write_apng(out: impl Write, size: [u32; 2], frames: &[Vec<u8>], fps: u16) -> io::Result<()> {
+pub fn write_apng(out: impl Write, size: [u32; 2], frames: &[&[u8]], fps: u16) -> io::Result<()> {
     let mut encoder = encoder(out, size);
     encoder.set_animated(frames.len() as u32, 0).map_err(io::Error::from)?;
     encoder.set_frame_delay(1, fps.max(1)).map_err(io::Error::from)?;

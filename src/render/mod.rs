@@ -9,6 +9,7 @@
 //! sampled at index coordinates and interpolated between them: its cells have eight voxels as corners,
 //! unless [`Interpolation::Nearest`] is asked for.
 
+mod black_body;
 mod camera;
 mod cpu;
 mod decoded_frame;
@@ -19,17 +20,19 @@ pub mod gpu;
 pub mod gpu;
 mod gpu_error;
 mod image;
+mod light;
 mod renderer;
 mod scene;
 mod surface;
 mod traverse;
 
-pub use camera::{Camera, CameraError, Lens, View, WorldBox};
-pub use cpu::{optical_depths, spread, trace, trace_noting_gpu_spread};
+pub use camera::{Camera, CameraError, Lens, Up, View, WorldBox};
+pub use cpu::{Medium, body_extinction, optical_depths, spread, trace, trace_noting_gpu_spread};
 pub use decoded_frame::DecodedFrame;
 pub use image::{Difference, Image, apart, difference, write_apng, write_png};
+pub use light::{Light, SOOTY_ALBEDO};
 pub use renderer::{Device, Renderer};
-pub use scene::{Scene, TraceError};
+pub use scene::{Emission, March, Scene, Step, TraceError};
 pub use traverse::{Box3, Ray, Real, Walk};
 
 use clap::ValueEnum;
@@ -39,7 +42,7 @@ use crate::pack::Grid;
 /// What a picture shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Mode {
-    /// Density accumulated along the ray, as opacity (Beer-Lambert); level sets: the same as lit
+    /// Density added up along the ray, as opacity (Beer-Lambert); level sets: the same as lit
     Density,
     /// Distance to the first hit
     Depth,
@@ -53,7 +56,7 @@ pub enum Mode {
     Nodes,
     /// The normal of the face through which the first hit was entered; level sets: of the surface
     Normals,
-    /// A level set in the sun, with its shadow
+    /// In the sun, with its own shadow; fog also scatters light and glows
     Lit,
 }
 
@@ -70,7 +73,7 @@ impl Mode {
         Self::Lit,
     ];
 
-    /// What shows a grid as people expect it.
+    /// What shows most of a grid's data: all of fog, the surface of a level set.
     pub fn of_grid(grid: &Grid) -> Self {
         if grid.is_level_set() { Self::Lit } else { Self::Density }
     }
@@ -81,13 +84,12 @@ impl Mode {
     }
 }
 
-/// What a level set is between its voxels.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+/// What a grid is between its voxels.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Interpolation {
-    /// What the nearest voxel is: its surface are the faces between voxels of different sign
+    /// What the nearest voxel is: fog is added up exactly, a level set's surface are the faces between voxels of different sign
     Nearest,
-    /// Trilinear between eight voxels: its surface is smooth
-    #[default]
+    /// Trilinear between eight voxels, as games sample it: fog is added up in steps, a level set's surface is smooth
     Trilinear,
 }
 

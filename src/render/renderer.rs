@@ -3,7 +3,9 @@
 use clap::ValueEnum;
 use serde::Serialize;
 
-use super::cpu::trace;
+use super::Mode;
+use super::camera::View;
+use super::cpu::{Medium, body_extinction, trace};
 use super::decoded_frame::DecodedFrame;
 use super::gpu::{Gpu, GpuError, Uploaded};
 use super::image::Image;
@@ -54,6 +56,20 @@ impl<'a> Renderer<'a> {
         }
     }
 
+    /// The same, but what is fastest here for [`Device::Auto`]: software Vulkan is slower than the CPU tracer, and takes
+    /// seconds to start.
+    ///
+    /// # Errors
+    /// See [`Renderer::new`].
+    pub fn fastest(pack: &'a Pack, device: Device) -> Result<Self, GpuError> {
+        let is_software = |gpu: &Gpu| gpu.is_software;
+        let device = match device {
+            Device::Auto if Gpu::shared().is_ok_and(is_software) => Device::Cpu,
+            asked => asked,
+        };
+        Self::new(pack, device)
+    }
+
     /// The name of what traces.
     pub fn device_name(&self) -> &str {
         self.gpu.as_ref().map_or("CPU tracer", |(gpu, _)| &gpu.name)
@@ -62,6 +78,19 @@ impl<'a> Renderer<'a> {
     /// Whether it is a GPU, or software that stands for one.
     pub fn is_gpu(&self) -> bool {
         self.gpu.is_some()
+    }
+
+    /// An extinction for lit pictures of a grid, from its frame with the most voxels: see [`body_extinction`].
+    ///
+    /// # Errors
+    /// When a chunk of the pack is damaged, or the frame cannot be traced.
+    pub fn body_extinction(&self, grid: usize, view: &View) -> Result<Option<f64>, GpuError> {
+        let of = &self.pack.grids()[grid];
+        let Some(frame) = (0..of.frames.len()).max_by_key(|&f| of.frames[f].record.active_voxels) else {
+            return Ok(None);
+        };
+        let scene = Scene::new(of, frame, view, Mode::Density, [1; 2]);
+        Ok(body_extinction(&DecodedFrame::from_pack(&self.pack.frame(grid, frame)?)?, &scene)?)
     }
 
     /// Traces a frame of a grid.
@@ -75,15 +104,20 @@ impl<'a> Renderer<'a> {
                 let traced = gpu.trace(uploaded, [grid as u32, frame as u32], reader.bounds(), scene);
                 match traced {
                     // A picture too large for the adapter.
-                    Err(GpuError::Lacks { .. }) if self.device == Device::Auto => on_cpu(&reader, scene),
+                    Err(GpuError::Lacks { .. }) if self.device == Device::Auto => self.on_cpu(&reader, scene),
                     traced => traced,
                 }
             }
-            None => on_cpu(&reader, scene),
+            None => self.on_cpu(&reader, scene),
         }
     }
-}
 
-fn on_cpu(reader: &FrameReader, scene: &Scene) -> Result<Image, GpuError> {
-    Ok(trace::<f32>(&DecodedFrame::from_pack(reader)?, scene)?)
+    fn on_cpu(&self, reader: &FrameReader, scene: &Scene) -> Result<Image, GpuError> {
+        let emission = match &scene.emission {
+            Some(other) => Some(DecodedFrame::from_pack(&self.pack.frame(other.grid, other.frame)?)?),
+            None => None,
+        };
+        let frame = DecodedFrame::from_pack(reader)?;
+        Ok(trace::<f32>(Medium { frame: &frame, emission: emission.as_ref() }, scene)?)
+    }
 }

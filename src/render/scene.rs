@@ -1,6 +1,8 @@
 //! What a picture shows and how, and what follows from it for all pixels: the input of both tracers.
 
-use super::camera::{Camera, Lens, View, WorldBox, apply3, invert3, length, normalise};
+use super::black_body::black_body;
+use super::camera::{Camera, Lens, Up, View, WorldBox, apply3, dot, invert3, length, normalise};
+use super::light::Light;
 use super::traverse::{Box3, MAX_CELL};
 use super::{Interpolation, Mode, Traversal};
 use crate::pack::Grid;
@@ -21,12 +23,92 @@ pub struct Scene {
     pub matrix: [f64; 16],
     /// Whether the grid's zero is a surface.
     pub level_set: bool,
-    /// How a level set is interpolated between voxels.
+    /// What the grid is between its voxels.
     pub interpolation: Interpolation,
+    /// How rays sample fog between voxels.
+    pub march: March,
+    /// How fog is lit.
+    pub light: Light,
+    /// What glows in lit fog.
+    pub emission: Option<Emission>,
     /// Optical depth of a density of 1 over a world unit.
     pub extinction: f64,
     /// Densities above this are a hit.
     pub threshold: f32,
+}
+
+/// The distance between two samples.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Step {
+    /// In voxels.
+    Voxels(f64),
+    /// In world units.
+    World(f64),
+}
+
+/// How rays sample fog between voxels.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct March {
+    /// The distance between two samples.
+    pub step: Step,
+    /// Whether each pixel's samples begin elsewhere, so that steps are seen as noise and not as rings.
+    pub jitter: bool,
+}
+
+impl Default for March {
+    /// Half a voxel, as NanoVDB's example does: no voxel is passed over.
+    fn default() -> Self {
+        Self { step: Step::Voxels(0.5), jitter: false }
+    }
+}
+
+/// A grid whose values glow.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Emission {
+    /// Which one of the pack.
+    pub grid: usize,
+    /// Its frame.
+    pub frame: usize,
+    /// Its index space to world space.
+    pub matrix: [f64; 16],
+    /// One over the value at which `ramp` ends.
+    pub per_unit: f64,
+    /// For values from 0 on what glows of it per world unit, in linear sRGB.
+    pub ramp: [[f32; 3]; RAMP_STEPS],
+}
+
+/// Colours of a ramp: on the way from dark red to yellow none is far from the next.
+pub const RAMP_STEPS: usize = 64;
+/// Radiance of the hottest after a tenth of the box's diagonal: much brighter than fog in the sun, since a fire is seen
+/// through its smoke.
+const GLOW: f64 = 20.0;
+/// Values up to here are no temperatures in kelvin.
+const LEAST_KELVIN: f32 = 100.0;
+/// What the hottest of other values is taken for: a yellow flame.
+const FLAME_KELVIN: f64 = 1900.0;
+
+impl Emission {
+    /// The glow of a grid of temperatures, or of flames, whose hottest is yellow. `kelvin` is what a value of 1 stands for.
+    /// Where it is not given, values of thousands are kelvins, and the largest of others is a flame.
+    /// A body glows with the fourth power of its temperature (Stefan and Boltzmann), in a black body's colour.
+    ///
+    /// # Panics
+    /// When there is no such frame.
+    pub fn new(grids: &[Grid], grid: usize, frame: usize, kelvin: Option<f64>, strength: f64) -> Self {
+        let of = &grids[grid];
+        let hottest = of.record.active_max.max(f32::MIN_POSITIVE);
+        let is_kelvin = hottest > LEAST_KELVIN;
+        let per_value = if is_kelvin { 1.0 } else { FLAME_KELVIN / f64::from(hottest) };
+        let kelvin = kelvin.unwrap_or(per_value) * f64::from(hottest);
+        let diagonal = WorldBox::of_grid(of).diagonal();
+        let brightest = if diagonal > 0.0 { strength * GLOW / (0.1 * diagonal) } else { 0.0 };
+        let ramp = std::array::from_fn(|i| {
+            let part = i as f64 / (RAMP_STEPS - 1) as f64;
+            black_body(part * kelvin).map(|c| (c * brightest * part.powi(4)) as f32)
+        });
+        let matrix = of.frames[frame].record.transform;
+        Self { grid, frame, matrix, per_unit: 1.0 / f64::from(hottest), ramp }
+    }
 }
 
 /// Optical depth through a whole box at its highest density: dense enough to see a surface, thin enough
@@ -46,14 +128,19 @@ impl Scene {
         // What is below 0 absorbs nothing.
         let densest = grid.record.active_max.max(0.0);
         let depth = bounds.diagonal() * f64::from(densest);
+        let level_set = grid.is_level_set();
         Self {
             mode,
             traversal: Traversal::default(),
-            camera: view.camera(&bounds),
+            camera: view.camera(&bounds, Up::of_box(&bounds), size),
             size,
             matrix: grid.frames[frame].record.transform,
-            level_set: grid.is_level_set(),
-            interpolation: Interpolation::default(),
+            level_set,
+            // Fog is added up voxel by voxel, which is exact.
+            interpolation: if level_set { Interpolation::Trilinear } else { Interpolation::Nearest },
+            march: March::default(),
+            light: Light::default(),
+            emission: None,
             extinction: if depth > 0.0 { BOX_DEPTH / depth } else { 0.0 },
             threshold: HIT_DENSITY * densest,
         }
@@ -61,16 +148,26 @@ impl Scene {
 
     /// Whether cells lie between voxels, which are their corners; else they are voxels.
     pub(super) fn is_trilinear(&self) -> bool {
-        self.level_set && self.interpolation == Interpolation::Trilinear
+        match self.mode {
+            _ if self.level_set => self.interpolation == Interpolation::Trilinear,
+            Mode::Density => self.interpolation == Interpolation::Trilinear,
+            // Lit fog is seen as games show it.
+            mode => mode == Mode::Lit,
+        }
     }
 }
 
-/// Towards the sun, in world space.
+/// Towards the sun of a level set: right, up, front.
 const SUN: [f64; 3] = [0.48, 0.80, 0.36];
 /// Light that reaches shadows.
 pub const AMBIENT: f64 = 0.15;
 /// A shadow ray begins this many cells off the surface, so that the surface does not shade itself.
 const SHADOW_OFFSET: f64 = 1.5;
+/// Voxels between two points of the lattice on which light is measured, where the box is small enough: shadows in fog are
+/// soft, and half as fine takes an eighth of the time.
+const LIGHT_SPACING: i32 = 2;
+/// Points of that lattice, at most: 2 MiB, and a second or two of a core.
+const MAX_LIGHT_POINTS: usize = 1 << 19;
 /// Why a frame cannot be traced.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum TraceError {
@@ -95,8 +192,26 @@ pub struct Setup {
     pub sun: [f64; 3],
     /// For a gradient in cell space, rows whose products are the normal in world space.
     pub normals: [[f64; 3]; 3],
-    /// Towards the sun, in world space.
+    /// Towards the sun of a level set, in world space.
     pub sun_world: [f64; 3],
+    /// The distance between two samples of fog, in world units, or in cells.
+    pub step: f64,
+    /// Whether it is in cells.
+    pub step_in_cells: bool,
+    /// Towards the sun of fog, in cells a world unit.
+    pub to_sun: [f64; 3],
+    /// For a ray's direction in cells, what the cosine of its angle with the sun is the product of.
+    pub sun_cosine: [f64; 3],
+    /// What fog scatters of the sun's light, where that is not dimmed.
+    pub sun_light: [f64; 3],
+    /// What fog scatters of the sky's light.
+    pub sky_light: [f64; 3],
+    /// Cells between two points of the lattice on which light is measured. The first is the box's first corner.
+    pub light_spacing: i32,
+    /// How many there are along each axis: the last ones lie on the box's end, or behind it.
+    pub light_points: [usize; 3],
+    /// Rows whose products with a place in cells, and 1, are the place in the grid that glows.
+    pub to_emission: [[f64; 4]; 3],
 }
 
 impl Setup {
@@ -122,9 +237,65 @@ impl Setup {
         // world = index · M, so gradients go by the inverse transposed: row r of it is what index
         // axis a has of world axis r.
         let inverse = invert3(&scene.matrix).ok_or(TraceError::Transform)?;
-        let sun_world = normalise(SUN);
+        let up = scene.camera.up;
+        let sun_world = normalise(up.to_world(SUN));
         let sun = apply3(&inverse, sun_world);
         let sun = sun.map(|v| v * SHADOW_OFFSET / length(sun));
-        Ok(Self { base, bounds, lens, sun, normals: inverse, sun_world })
+        let fog_sun = scene.light.to_sun(up);
+        let row = |r: usize| std::array::from_fn(|c| scene.matrix[4 * r + c]);
+        let (light_spacing, light_points) = light_lattice(bounds);
+        let (step, step_in_cells) = match scene.march.step {
+            Step::Voxels(step) => (step, true),
+            Step::World(step) => (step, false),
+        };
+        Ok(Self {
+            base,
+            bounds,
+            lens,
+            sun,
+            normals: inverse,
+            sun_world,
+            step,
+            step_in_cells,
+            to_sun: apply3(&inverse, fog_sun),
+            sun_cosine: std::array::from_fn(|r| dot(row(r), fog_sun)),
+            sun_light: scene.light.sun_light(),
+            sky_light: scene.light.sky_light(),
+            light_spacing,
+            light_points,
+            to_emission: match &scene.emission {
+                Some(emission) => to_emission(&scene.matrix, &emission.matrix, base)?,
+                None => [[0.0; 4]; 3],
+            },
+        })
     }
+}
+
+/// Spacing and number of points along each axis, for a box.
+fn light_lattice(bounds: Box3) -> (i32, [usize; 3]) {
+    let points = |spacing: i32| -> [usize; 3] {
+        std::array::from_fn(|a| {
+            let cells = (bounds.max[a] - bounds.min[a]).max(1) as usize;
+            cells.div_ceil(spacing as usize) + 1
+        })
+    };
+    let is_enough = |spacing: &i32| {
+        let points = points(*spacing);
+        points.into_iter().try_fold(1usize, usize::checked_mul).is_some_and(|n| n <= MAX_LIGHT_POINTS)
+    };
+    // A box is at most MAX_CELL wide, and two points an axis are always few enough.
+    let spacing = (LIGHT_SPACING..=MAX_CELL).find(is_enough).unwrap_or(MAX_CELL);
+    (spacing, points(spacing))
+}
+
+/// From cells, counted from `base`, of a grid with one matrix to the index space of one with another.
+fn to_emission(from: &[f64; 16], to: &[f64; 16], base: [i32; 3]) -> Result<[[f64; 4]; 3], TraceError> {
+    let inverse = invert3(to).ok_or(TraceError::Transform)?;
+    let row = |r: usize| [from[4 * r], from[4 * r + 1], from[4 * r + 2]];
+    let axes = [0, 1, 2].map(|r| apply3(&inverse, row(r)));
+    let moved = std::array::from_fn(|c| from[12 + c] - to[12 + c]);
+    let base = base.map(f64::from);
+    let origin = apply3(&inverse, moved);
+    let at_base = |c: usize| origin[c] + (0..3).map(|r| base[r] * axes[r][c]).sum::<f64>();
+    Ok(std::array::from_fn(|c| [axes[0][c], axes[1][c], axes[2][c], at_base(c)]))
 }

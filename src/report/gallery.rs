@@ -155,7 +155,7 @@ fn strip(pack: &Pack, g: usize, extinction: Option<f64>, cancel: &CancelToken) -
         })?;
         let scene = Scene::new(grid, f, &View::default(), mode, [STRIP_SIDE; 2]);
         let scene = Scene { extinction: extinction.unwrap_or(scene.extinction), ..scene };
-        Ok(trace::<f32>(&field, &scene).ok().map(|image| image.to_rgb8(mode)))
+        Ok(trace::<f32>(&field, &scene).ok().map(|image| image.to_rgb8(&scene)))
     };
     let pictures = frames.par_iter().map(draw).collect::<Result<Option<Vec<_>>>>()?;
     let Some(pictures) = pictures else { return Ok(None) };

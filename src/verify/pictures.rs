@@ -202,7 +202,7 @@ fn compare_grid(
                 renderer.device_name()
             ));
         }
-        let (a, b) = (of_source.to_rgb8(scene.mode), of_pack.to_rgb8(scene.mode));
+        let (a, b) = (of_source.to_rgb8(&scene), of_pack.to_rgb8(&scene));
         if let Some(folder) = &settings.images {
             let name = file_name(&grid.name, grid.frames[f].record.number);
             write_side_by_side(&folder.join(name), &a, &b)?;
@@ -336,7 +336,7 @@ pub fn look(
 ) -> Result<Option<Seen>> {
     let scene = scene(&pack.grids()[g], f);
     let scene = Scene { extinction: extinction.unwrap_or(scene.extinction), ..scene };
-    let draw = |field: &DecodedFrame| trace::<f32>(field, &scene).map(|image| image.to_rgb8(scene.mode));
+    let draw = |field: &DecodedFrame| trace::<f32>(field, &scene).map(|image| image.to_rgb8(&scene));
     let Ok(of_pack) = draw(&packed_field(pack, [g, f])?) else { return Ok(None) };
     let source = sources.map(|sources| source_field(pack, sources, [g, f])).transpose()?;
     let source = source.and_then(|field| draw(&field).ok());

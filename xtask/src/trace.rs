@@ -39,11 +39,11 @@ pub struct Args {
 }
 
 /// Along (-0.6, -0.35, -0.72) from one diagonal away.
-const VIEW: View = View::Orbit([39.8056, 20.4927, 1.0]);
+const VIEW: View = View::Orbit { azimuth: 39.8056, elevation: 20.4927, distance: Some(1.0) };
 
 /// What is shown of a level set or of fog: its name, which is the peer's word too, and how.
 type Shown = (&'static str, Mode, Interpolation);
-const FOG: &[Shown] = &[("fog", Mode::Density, Interpolation::Trilinear)];
+const FOG: &[Shown] = &[("fog", Mode::Density, Interpolation::Nearest)];
 const LEVEL_SET: &[Shown] =
     &[("trilinear", Mode::Depth, Interpolation::Trilinear), ("nearest", Mode::Depth, Interpolation::Nearest)];
 

@@ -24,6 +24,7 @@ impl Coord {
     }
 
     /// The origin of the cube with side `dim` (a power of two) that holds this voxel.
+    #[inline]
     pub fn align_down(self, dim: i32) -> Self {
         debug_assert!(dim.count_ones() == 1);
         Self(self.0.map(|c| c & !(dim - 1)))
@@ -35,6 +36,7 @@ impl Coord {
     }
 
     /// This coordinate moved by `offset`. The sum must fit an `i32`, as it does inside any node.
+    #[inline]
     pub fn offset_by(self, offset: [i32; 3]) -> Self {
         Self(std::array::from_fn(|a| self.0[a] + offset[a]))
     }
@@ -52,6 +54,7 @@ impl Coord {
 
     /// The inverse of [`Coord::child_offset`]: which child of the aligned node around this voxel
     /// holds it.
+    #[inline]
     pub fn child_index(self, log2: u32, child_dim: i32) -> usize {
         let mask = (1i32 << log2) - 1;
         let shift = child_dim.trailing_zeros();

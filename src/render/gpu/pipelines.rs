@@ -11,7 +11,7 @@ use super::{TRACER_WGSL, VOLPACK_WGSL};
 use crate::codec::Codec;
 use crate::pack::Pack;
 use crate::pack::tree::header;
-use crate::render::{Interpolation, Mode, Scene, Traversal};
+use crate::render::{Mode, Scene, Traversal};
 
 /// What occurs in a pack, as far as the shader cares.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -38,19 +38,32 @@ struct PipelineKey {
     hdda: bool,
     level_set: bool,
     trilinear: bool,
+    glows: bool,
     has: Has,
+}
+
+/// What draws a picture.
+#[derive(Clone)]
+pub struct Drawing {
+    /// Fills the lattice of light, of lit fog.
+    pub light: Option<wgpu::ComputePipeline>,
+    /// Traces the rays.
+    pub trace: wgpu::ComputePipeline,
 }
 
 /// Pixels of a workgroup, as `main` in `tracer.wgsl` has them: of the shapes from 8 × 4 to 16 × 16 the
 /// fastest on an NVIDIA H200, by 3 to 20 %.
 pub const WORKGROUP: [u32; 2] = [8, 16];
 
+/// Points of the light's lattice that a workgroup measures, as `measure_light` has them.
+pub const LIGHT_WORKGROUP: u32 = 64;
+
 /// The pipelines of one device, and what they share.
 pub struct Pipelines {
     module: wgpu::ShaderModule,
     bindings: wgpu::BindGroupLayout,
     layout: wgpu::PipelineLayout,
-    made: Mutex<HashMap<PipelineKey, wgpu::ComputePipeline>>,
+    made: Mutex<HashMap<PipelineKey, Drawing>>,
 }
 
 impl Pipelines {
@@ -67,7 +80,7 @@ impl Pipelines {
         let checks =
             wgpu::ShaderRuntimeChecks { force_loop_bounding: false, ..wgpu::ShaderRuntimeChecks::checked() };
         // SAFETY: without these checks all loops must end, and they do whatever the pack says: walks count
-        // steps up to MAX_STEPS or move towards a plane a cell at a time, `vp_settle` moves one way between
+        // steps up to MAX_STEPS or VP_MAX_STEPS, or move towards a plane a cell at a time, `vp_settle` moves one way between
         // two cells, parts of a cell are 8, halvings 24.
         let module = unsafe { device.create_shader_module_trusted(shader, checks) };
         let bindings = bindings(device);
@@ -83,38 +96,47 @@ impl Pipelines {
         &self.bindings
     }
 
-    /// The pipeline that traces a scene from a pack.
-    pub fn get(&self, device: &wgpu::Device, has: Has, scene: &Scene) -> wgpu::ComputePipeline {
+    /// The pipelines that trace a scene from a pack.
+    pub fn get(&self, device: &wgpu::Device, has: Has, scene: &Scene) -> Drawing {
         let key = PipelineKey {
             mode: scene.mode as u32,
             hdda: scene.traversal == Traversal::Hdda,
             level_set: scene.level_set,
-            trilinear: scene.interpolation == Interpolation::Trilinear,
+            trilinear: scene.is_trilinear(),
+            glows: scene.emission.is_some(),
             has,
         };
         let mut made = self.made.lock().unwrap_or_else(PoisonError::into_inner);
         made.entry(key).or_insert_with(|| self.make(device, key)).clone()
     }
 
-    fn make(&self, device: &wgpu::Device, key: PipelineKey) -> wgpu::ComputePipeline {
-        device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
-            label: Some("tracer"),
-            layout: Some(&self.layout),
-            module: &self.module,
-            entry_point: Some("main"),
-            compilation_options: wgpu::PipelineCompilationOptions {
-                constants: &[
-                    ("MODE", key.mode.into()),
-                    ("HDDA", key.hdda.into()),
-                    ("LEVEL_SET", key.level_set.into()),
-                    ("TRILINEAR", key.trilinear.into()),
-                    ("VP_CODECS", key.has.codecs.into()),
-                    ("VP_MASKS", key.has.masks.into()),
-                ],
-                ..Default::default()
-            },
-            cache: None,
-        })
+    fn make(&self, device: &wgpu::Device, key: PipelineKey) -> Drawing {
+        let is_lit = key.mode == Mode::Lit as u32;
+        let pipeline = |entry_point| {
+            device.create_compute_pipeline(&wgpu::ComputePipelineDescriptor {
+                label: Some(entry_point),
+                layout: Some(&self.layout),
+                module: &self.module,
+                entry_point: Some(entry_point),
+                compilation_options: wgpu::PipelineCompilationOptions {
+                    constants: &[
+                        ("MODE", key.mode.into()),
+                        ("HDDA", key.hdda.into()),
+                        ("LEVEL_SET", key.level_set.into()),
+                        ("TRILINEAR", key.trilinear.into()),
+                        ("VP_CODECS", key.has.codecs.into()),
+                        ("VP_MASKS", key.has.masks.into()),
+                        ("VP_LIT", is_lit.into()),
+                        ("VP_GLOWS", key.glows.into()),
+                        ("VP_SKIPS", key.hdda.into()),
+                    ],
+                    ..Default::default()
+                },
+                cache: None,
+            })
+        };
+        let needs_light = is_lit && !key.level_set;
+        Drawing { light: needs_light.then(|| pipeline("measure_light")), trace: pipeline("main") }
     }
 }
 
@@ -135,6 +157,7 @@ fn bindings(device: &wgpu::Device) -> wgpu::BindGroupLayout {
         entry(0, buffer(wgpu::BufferBindingType::Uniform)),
         entry(1, buffer(wgpu::BufferBindingType::Storage { read_only: true })),
         entry(2, buffer(wgpu::BufferBindingType::Storage { read_only: false })),
+        entry(3, buffer(wgpu::BufferBindingType::Storage { read_only: false })),
     ];
     let texture_bindings = (FIRST_TEXTURE..).take(Codec::WITH_TEXELS.len());
     entries.extend(texture_bindings.map(|binding| entry(binding, texture)));
@@ -142,7 +165,7 @@ fn bindings(device: &wgpu::Device) -> wgpu::BindGroupLayout {
 }
 
 /// The binding of the first codec's texture.
-const FIRST_TEXTURE: u32 = 3;
+const FIRST_TEXTURE: u32 = 4;
 
 /// The codecs' textures, and what reads them for `volpack.wgsl`. One page a codec is bound here; an engine with more
 /// chooses by page.

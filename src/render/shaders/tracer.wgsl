@@ -1,4 +1,4 @@
-// tracer.wgsl: bindings, camera and modes around volpack.wgsl. src/render/cpu.rs is its twin.
+// tracer.wgsl: bindings, camera and modes around volpack.wgsl and march.wgsl. src/render/cpu/mod.rs is its twin.
 
 struct Params {
     origin: vec3f,          // the eye, in cells from base
@@ -20,20 +20,37 @@ struct Params {
     sun_world: vec3f,
     ambient: f32,
     normal_x: vec3f,        // rows whose products with a gradient are the normal in world space
+    step: f32,              // between two samples of fog, in world units or in cells
     normal_y: vec3f,
+    step_in_cells: u32,
     normal_z: vec3f,
+    jitter: u32,            // whether each pixel's samples begin elsewhere
+    to_sun: vec3f,          // towards the sun of fog, in cells a world unit
+    anisotropy: f32,
+    sun_cosine: vec3f,      // its product with a direction in cells is the cosine of the angle with the sun
+    light_spacing: i32,     // cells between two points of the lattice on which light is measured
+    light_points: vec3u,    // how many there are along each axis
+    emission_grid: u32,
+    sun_light: vec3f,       // what fog scatters of the sun's light, where that is not dimmed
+    emission_frame: u32,
+    sky_light: vec3f,       // what it scatters of the sky's
+    emission_scale: f32,    // from values to places on the ramp
+    backdrop: vec3f,        // what is behind lit fog
+    to_emission: array<vec4f, 3>,       // rows whose products with a place in cells, and 1, are that in the other grid
+    ramp: array<vec4f, 64>,             // what glows per world unit
 }
 
 // A pipeline does one thing: what it does not is left out of its code, and costs no registers.
 override MODE: u32 = 0u;
 override HDDA: bool = true;
 override LEVEL_SET: bool = false;
-override TRILINEAR: bool = true;     // of level sets: else the nearest voxel
+override TRILINEAR: bool = true;     // else the nearest voxel
 
 @group(0) @binding(0) var<uniform> params: Params;
 @group(0) @binding(1) var<storage, read> tree: array<u32>;
 @group(0) @binding(2) var<storage, read_write> output: array<vec4f>;
-// From binding 3 on a texture a codec. They and vp_texel, which reads them, are written by src/render/gpu/pipelines.rs.
+@group(0) @binding(3) var<storage, read_write> depths_to_sun: array<f32>;
+// From binding 4 on a texture a codec. They and vp_texel, which reads them, are written by src/render/gpu/pipelines.rs.
 
 fn vp_word(i: u32) -> u32 {
     return tree[i];
@@ -46,6 +63,7 @@ const BRICKS = 3u;
 const STEPS = 4u;
 const NODES = 5u;
 const NORMALS = 6u;
+const LIT = 7u;
 const MAX_STEPS = 65536u;
 
 var<private> steps: u32;
@@ -70,39 +88,51 @@ fn traced(walk: VpWalk) -> bool {
     return vp_inside(walk.cell, params.low, params.high) && steps < MAX_STEPS;
 }
 
-// The integral of density over distance. What is below 0 absorbs nothing.
-fn optical_depth(ray: VpRay) -> f32 {
-    var depth = 0.0;
-    var walk = vp_enter(ray, params.low, params.high);
-    if !traced(walk) {
-        return depth;
+// The fog that params describe, for a ray whose t is in world units.
+fn fog_of(ray: VpRay) -> VpFog {
+    let t_of_step = select(1.0, 1.0 / length(ray.direction), params.step_in_cells != 0u);
+    let phase = vp_phase(params.anisotropy, dot(ray.direction, params.sun_cosine));
+    return VpFog(
+        params.base, params.grid, params.low, params.frame, params.high, params.extinction,
+        params.sun_light * phase, params.step * t_of_step, params.sky_light,
+    );
+}
+
+// Where a pixel's first sample may lie, in steps: in the middle of the step, or anywhere in it.
+fn first_sample(pixel: vec2u) -> f32 {
+    if params.jitter == 0u {
+        return 0.5;
     }
-    let g = vp_grid(params.grid);
-    var cell = VP_NOWHERE;
-    while traced(walk) {
-        let at = place_of(g, cell, walk.cell);
-        cell = at.cell;
-        if HDDA && at.node.constant {
-            steps++;
-            let start = walk.t;
-            walk = vp_leave(ray, walk, at.low, at.high);
-            depth += (walk.t - start) * max(at.node.value, 0.0);
-            continue;
-        }
-        let brick = vp_brick(g, at.node);
-        let behind = vp_behind(ray, at.low, at.high);
-        loop {
-            steps++;
-            let value = vp_value(g, brick, walk.cell + params.base);
-            let start = walk.t;
-            walk = vp_step(ray, walk);
-            depth += (walk.t - start) * max(value, 0.0);
-            if any(walk.cell == behind) {
-                break;
-            }
-        }
+    // The hash "lowbias32" of Wellons ("Prospecting for hash functions", 2018).
+    var h = pixel.y * params.width + pixel.x;
+    h = (h ^ (h >> 16u)) * 0x7feb352du;
+    h = (h ^ (h >> 15u)) * 0x846ca68bu;
+    h ^= h >> 16u;
+    return f32(h >> 8u) / 16777216.0;
+}
+
+fn vp_depth_to_sun(p: vec3f) -> f32 {
+    let place = (p - vec3f(params.low)) / f32(params.light_spacing);
+    let low = vec3u(clamp(vec3i(floor(place)), vec3i(0), vec3i(params.light_points) - 2));
+    let y = params.light_points.x;
+    let z = y * params.light_points.y;
+    let i = low.z * z + low.y * y + low.x;
+    let near = vec4f(depths_to_sun[i], depths_to_sun[i + 1u], depths_to_sun[i + y], depths_to_sun[i + y + 1u]);
+    let j = i + z;
+    let far = vec4f(depths_to_sun[j], depths_to_sun[j + 1u], depths_to_sun[j + y], depths_to_sun[j + y + 1u]);
+    return vp_between(VpCorners(near, far), place - vec3f(low));
+}
+
+fn vp_glow(p: vec3f) -> vec3f {
+    let at = vec4f(p, 1.0);
+    let m = params.to_emission;
+    let place = vec3f(dot(m[0], at), dot(m[1], at), dot(m[2], at));
+    let value = vp_trilinear(vp_grid(params.emission_grid), params.emission_frame, place) * params.emission_scale;
+    if !(value > 0.0) {
+        return vec3f(0.0);
     }
-    return depth;
+    let low = min(u32(value), 62u);
+    return mix(params.ramp[low].xyz, params.ramp[low + 1u].xyz, min(value - f32(low), 1.0));
 }
 
 struct Hit {
@@ -455,6 +485,7 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
         return;
     }
     steps = 0u;
+    vp_steps = 0u;
     let x = f32(2u * id.x + 1u) / f32(params.width) - 1.0;
     let y = 1.0 - f32(2u * id.y + 1u) / f32(params.height);
     let edge = vec2f(x * params.half_width, y * params.half_height);
@@ -462,13 +493,33 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
     let ray = vp_ray(params.origin, ahead / sqrt(1.0 + edge.x * edge.x + edge.y * edge.y));
 
     var color: vec3f;
-    if MODE == DENSITY && !LEVEL_SET {
-        color = vec3f(1.0 - exp(-(optical_depth(ray) * params.extinction)));
-    } else {
+    if LEVEL_SET || (MODE != DENSITY && MODE != LIT) {
         color = shade(ray, first_hit(ray));
+    } else if TRILINEAR {
+        let marched = vp_march(fog_of(ray), ray, first_sample(id.xy));
+        let through = exp(-marched.depth);
+        color = select(vec3f(1.0 - through), marched.light + through * params.backdrop, VP_LIT);
+    } else {
+        color = vec3f(1.0 - exp(-(vp_voxel_depth(fog_of(ray), ray) * params.extinction)));
     }
+    steps += vp_steps;
     if MODE == STEPS {
         color = vec3f(f32(steps));
     }
     output[id.y * params.width + id.x] = vec4f(color, f32(steps));
+}
+
+// Fills the lattice of optical depths to the sun.
+@compute @workgroup_size(64)
+fn measure_light(@builtin(global_invocation_id) id: vec3u) {
+    let points = params.light_points;
+    let i = id.x;
+    if i >= points.x * points.y * points.z {
+        return;
+    }
+    vp_steps = 0u;
+    let point = vec3u(i % points.x, i / points.x % points.y, i / (points.x * points.y));
+    let origin = vec3f(params.low + vec3i(point) * params.light_spacing) + 0.5;
+    let ray = vp_ray(origin, params.to_sun);
+    depths_to_sun[i] = vp_voxel_depth(fog_of(ray), ray) * params.extinction;
 }

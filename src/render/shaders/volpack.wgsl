@@ -14,9 +14,10 @@
 //   vp_value(g, brick, p)               a voxel's value
 //   vp_voxel(g, frame, p)               all of these in one: point fetch
 //   vp_trilinear(g, frame, p)           eight point fetches, interpolated
+//   vp_corners, vp_between              the same in two parts, for a brick that is kept
 //   vp_sign, vp_alone, vp_idle          whether a node or a cell can hold a zero, without a texel
 //
-// hdda.wgsl goes with it, for rays.
+// hdda.wgsl goes with it, for rays, and march.wgsl, for lit fog.
 //
 // Coordinates are OpenVDB's index coordinates. docs/format.md is the specification of what is read.
 
@@ -319,16 +320,19 @@ fn vp_corners(g: VpGrid, frame: u32, cell: VpCell, brick: VpBrick, p: vec3i) -> 
     return c;
 }
 
-// p in index space, between voxels.
-fn vp_trilinear(g: VpGrid, frame: u32, p: vec3f) -> f32 {
-    let low = floor(p);
-    let f = p - low;
-    let voxel = vec3i(low);
-    let cell = vp_cell(g, frame, VP_NOWHERE, voxel);
-    let c = vp_corners(g, frame, cell, vp_brick(g, vp_find(g, cell, voxel)), voxel);
+// Between the corners of a cell: f goes from 0 to 1 along each axis.
+fn vp_between(c: VpCorners, f: vec3f) -> f32 {
     let z = mix(c.near, c.far, f.z);
     let y = mix(z.xy, z.zw, f.y);
     return mix(y.x, y.y, f.x);
+}
+
+// p in index space, between voxels.
+fn vp_trilinear(g: VpGrid, frame: u32, p: vec3f) -> f32 {
+    let low = floor(p);
+    let voxel = vec3i(low);
+    let cell = vp_cell(g, frame, VP_NOWHERE, voxel);
+    return vp_between(vp_corners(g, frame, cell, vp_brick(g, vp_find(g, cell, voxel)), voxel), p - low);
 }
 
 // ---- Signs ----------------------------------------------------------------------------------------

@@ -1,41 +1,61 @@
 //! The CPU tracer.
 //!
 //! In `f64` with [`Traversal::Dda`] it is the reference; in `f32` with [`Traversal::Hdda`] it is the
-//! shader's twin, line by line (`shaders/tracer.wgsl`). It is one file, as the shader is, so that the two can be read side
-//! by side.
+//! shader's twin, line by line: this file of `shaders/tracer.wgsl`, `march.rs` of `shaders/march.wgsl`.
+
+mod march;
 
 use rayon::prelude::*;
 
+use self::march::LightGrid;
 use super::camera::{dot, normalise};
-use super::decoded_frame::{Content, DecodedFrame};
+use super::decoded_frame::{Content, DecodedBrick, DecodedFrame, Nearby};
 use super::image::{Image, apart, opacity};
 use super::scene::{AMBIENT, Scene, Setup, TraceError};
 use super::surface::{cubic, evaluate, first_change};
 use super::traverse::{Box3, Ray, Real, Walk};
-use super::{Mode, Traversal};
+use super::{Interpolation, Mode, Traversal};
 use crate::volume::{BRICK_DIM, Coord, L1_DIM, L2_DIM};
 
 /// Steps after which a ray is given up: more than any box in view has cells across.
 const MAX_STEPS: u32 = 1 << 16;
 
+/// What there is in a picture: a frame of a grid, and one of the grid that glows in it if [`Scene::emission`] names one.
+#[derive(Clone, Copy)]
+pub struct Medium<'a> {
+    /// The grid that is shown.
+    pub frame: &'a DecodedFrame,
+    /// The grid that glows.
+    pub emission: Option<&'a DecodedFrame>,
+}
+
+impl<'a> From<&'a DecodedFrame> for Medium<'a> {
+    fn from(frame: &'a DecodedFrame) -> Self {
+        Self { frame, emission: None }
+    }
+}
+
 /// Traces a picture: four numbers a pixel, of which the last is the steps taken.
 ///
 /// # Errors
 /// [`TraceError`].
-pub fn trace<F: Real>(frame: &DecodedFrame, scene: &Scene) -> Result<Image, TraceError> {
-    Ok(trace_noting_gpu_spread::<F>(frame, scene)?.0)
+pub fn trace<'a, F: Real>(medium: impl Into<Medium<'a>>, scene: &Scene) -> Result<Image, TraceError> {
+    Ok(trace_noting_gpu_spread::<F>(medium, scene)?.0)
 }
 
 /// The same, and for each pixel whether its rays read a brick whose texels GPUs decode differently: BC4.
 ///
 /// # Errors
 /// [`TraceError`].
-pub fn trace_noting_gpu_spread<F: Real>(
-    frame: &DecodedFrame,
+pub fn trace_noting_gpu_spread<'a, F: Real>(
+    medium: impl Into<Medium<'a>>,
     scene: &Scene,
 ) -> Result<(Image, Vec<bool>), TraceError> {
-    let setup = Setup::new(scene, frame.bounds)?;
-    let tracer = Tracer::<F>::new(frame, scene, &setup);
+    let medium = medium.into();
+    let setup = Setup::new(scene, medium.frame.bounds)?;
+    let dark = Tracer::<F>::new(medium, scene, &setup);
+    let light = dark.light_grid();
+    let tracer = Tracer { light: light.as_ref(), ..dark };
     let [width, height] = scene.size;
     let pixels = (0..width * height).into_par_iter().map(|i| tracer.pixel(i % width, i / width));
     let (pixels, varies) = pixels.unzip();
@@ -50,7 +70,9 @@ pub fn trace_noting_gpu_spread<F: Real>(
 /// [`TraceError`].
 pub fn spread(frame: &DecodedFrame, scene: &Scene, pixels: &[usize]) -> Result<Vec<f32>, TraceError> {
     let setup = Setup::new(scene, frame.bounds)?;
-    let tracer = Tracer::<f32>::new(frame, scene, &setup);
+    let dark = Tracer::<f32>::new(frame.into(), scene, &setup);
+    let light = dark.light_grid();
+    let tracer = Tracer { light: light.as_ref(), ..dark };
     let width = scene.size[0] as usize;
     let spread = |&pixel: &usize| {
         let [x, y] = [pixel % width, pixel / width].map(|v| v as u32);
@@ -68,7 +90,7 @@ pub fn spread(frame: &DecodedFrame, scene: &Scene, pixels: &[usize]) -> Result<V
 /// [`TraceError`].
 pub fn optical_depths<F: Real>(frame: &DecodedFrame, scene: &Scene) -> Result<Vec<f32>, TraceError> {
     let setup = Setup::new(scene, frame.bounds)?;
-    let tracer = Tracer::<F> { extinction: F::from_i32(1), ..Tracer::new(frame, scene, &setup) };
+    let tracer = Tracer::<F> { extinction: F::from_i32(1), ..Tracer::new(frame.into(), scene, &setup) };
     let [width, height] = scene.size;
     let depth = |i| {
         let ray = tracer.ray(i % width, i / width);
@@ -77,19 +99,56 @@ pub fn optical_depths<F: Real>(frame: &DecodedFrame, scene: &Scene) -> Result<Ve
     Ok((0..width * height).into_par_iter().map(depth).collect())
 }
 
+/// Pixels of the side of the picture from which an extinction is found: enough for a median.
+const MEDIAN_SIDE: u32 = 64;
+/// What is thinner than this part of the thickest fog is not counted as covered.
+const COVERED_PART: f32 = 0.01;
+/// Optical depth in the middle of what fog covers: half of it hides what is behind, and the other half is seen through.
+const BODY_DEPTH: f64 = 3.0;
+
+/// An extinction at which fog is seen as a body with thin edges: half of the pixels that it covers have an optical depth of
+/// 3. That of the highest density alone leaves most smoke too thin, because of a few dense voxels. `None` where nothing is
+/// seen.
+///
+/// # Errors
+/// [`TraceError`].
+pub fn body_extinction(frame: &DecodedFrame, scene: &Scene) -> Result<Option<f64>, TraceError> {
+    let scene = Scene {
+        size: [MEDIAN_SIDE; 2],
+        mode: Mode::Density,
+        interpolation: Interpolation::Nearest,
+        ..*scene
+    };
+    let mut depths = optical_depths::<f32>(frame, &scene)?;
+    let thickest = depths.iter().copied().filter(|depth| depth.is_finite()).fold(0.0, f32::max);
+    depths.retain(|depth| depth.is_finite() && *depth > COVERED_PART * thickest);
+    if depths.is_empty() {
+        return Ok(None);
+    }
+    let middle = depths.len() / 2;
+    let (_, median, _) = depths.select_nth_unstable_by(middle, f32::total_cmp);
+    Ok(Some(BODY_DEPTH / f64::from(*median)))
+}
+
 /// What the rays of a pixel met.
 #[derive(Default)]
-struct Visited {
+struct Visited<'a> {
     steps: u32,
     varies: bool,
+    nearby: Nearby<'a>,
+    /// The same in the grid that glows.
+    emission_nearby: Nearby<'a>,
 }
 
 #[derive(Clone, Copy)]
 struct Tracer<'a, F> {
     frame: &'a DecodedFrame,
+    emission: Option<&'a DecodedFrame>,
     scene: &'a Scene,
     setup: &'a Setup,
     extinction: F,
+    /// What the sun leaves of itself in the fog, of a picture that is lit.
+    light: Option<&'a LightGrid<F>>,
     /// Which of the [`PERTURBATIONS`] moves rays and values: a bit for each axis, and one for the sign of
     /// [`perturbation_sign`].
     perturbation: Option<u32>,
@@ -112,8 +171,10 @@ struct Hit<F> {
 }
 
 impl<'a, F: Real> Tracer<'a, F> {
-    fn new(frame: &'a DecodedFrame, scene: &'a Scene, setup: &'a Setup) -> Self {
-        Self { frame, scene, setup, extinction: F::from_f64(scene.extinction), perturbation: None }
+    fn new(medium: Medium<'a>, scene: &'a Scene, setup: &'a Setup) -> Self {
+        let Medium { frame, emission } = medium;
+        let extinction = F::from_f64(scene.extinction);
+        Self { frame, emission, scene, setup, extinction, light: None, perturbation: None }
     }
 
     fn ray(&self, x: u32, y: u32) -> Ray<F> {
@@ -131,12 +192,21 @@ impl<'a, F: Real> Tracer<'a, F> {
     fn pixel(&self, x: u32, y: u32) -> ([f32; 4], bool) {
         let ray = self.ray(x, y);
         let mut visited = Visited::default();
-        let color = if self.scene.mode == Mode::Density && !self.scene.level_set {
-            let depth = self.optical_depth(&ray, &mut visited);
-            [opacity(depth, self.extinction).to_f64() as f32; 3]
-        } else {
-            let hit = self.first_hit(&ray, &mut visited);
-            self.shade(&ray, hit, &mut visited)
+        let fog = !self.scene.level_set;
+        let color = match self.scene.mode {
+            Mode::Density if fog => {
+                let depth = if self.scene.is_trilinear() {
+                    self.marched_depth(&ray, self.first_sample(x, y), &mut visited)
+                } else {
+                    self.optical_depth(&ray, &mut visited)
+                };
+                [opacity(depth, self.extinction).to_f64() as f32; 3]
+            }
+            Mode::Lit if fog => self.lit_fog(&ray, self.first_sample(x, y), &mut visited),
+            _ => {
+                let hit = self.first_hit(&ray, &mut visited);
+                self.shade(&ray, hit, &mut visited)
+            }
         };
         let steps = visited.steps as f32;
         let [r, g, b] = if self.scene.mode == Mode::Steps { [steps; 3] } else { color };
@@ -155,19 +225,14 @@ impl<'a, F: Real> Tracer<'a, F> {
 
     /// The node to step over (the whole of it for HDDA where it has one value, else one cell), whether
     /// it has one value, and the value of the cell's voxel.
-    fn node(&self, cell: [i32; 3], visited: &mut Visited) -> (Box3, bool, f32) {
+    fn node(&self, cell: [i32; 3], visited: &mut Visited<'a>) -> (Box3, bool, f32) {
         let voxel = self.voxel(cell);
-        let found = self.frame.find(voxel);
+        let found = self.frame.find(voxel, &mut visited.nearby);
         let (constant, value) = match found.content {
             Content::Constant(constant) => (true, constant.value),
             Content::Brick(brick) => {
                 visited.varies |= brick.uncertainty > 0.0;
-                let value = brick.values[voxel.child_index(3, 1)];
-                (
-                    false,
-                    value
-                        + self.perturbation.map_or(0.0, |p| brick.uncertainty * perturbation_sign(p, voxel)),
-                )
+                (false, self.brick_value(brick, voxel))
             }
         };
         if constant && self.skips() {
@@ -177,8 +242,13 @@ impl<'a, F: Real> Tracer<'a, F> {
         (Box3::cube(cell, 1), constant, value)
     }
 
+    fn brick_value(&self, brick: &DecodedBrick, voxel: Coord) -> f32 {
+        let moved = self.perturbation.map_or(0.0, |p| brick.uncertainty * perturbation_sign(p, voxel));
+        brick.values[voxel.child_index(3, 1)] + moved
+    }
+
     /// The integral of density over distance. What is below 0 absorbs nothing.
-    fn optical_depth(&self, ray: &Ray<F>, visited: &mut Visited) -> F {
+    fn optical_depth(&self, ray: &Ray<F>, visited: &mut Visited<'a>) -> F {
         let mut depth = F::from_i32(0);
         let bounds = self.setup.bounds;
         let Some(mut walk) = Walk::enter(ray, bounds) else { return depth };
@@ -192,7 +262,7 @@ impl<'a, F: Real> Tracer<'a, F> {
         depth
     }
 
-    fn first_hit(&self, ray: &Ray<F>, visited: &mut Visited) -> Option<Hit<F>> {
+    fn first_hit(&self, ray: &Ray<F>, visited: &mut Visited<'a>) -> Option<Hit<F>> {
         let bounds = self.setup.bounds;
         let walk = Walk::enter(ray, bounds)?;
         if self.scene.is_trilinear() {
@@ -213,7 +283,7 @@ impl<'a, F: Real> Tracer<'a, F> {
         ray: &Ray<F>,
         bounds: Box3,
         mut walk: Walk<F>,
-        visited: &mut Visited,
+        visited: &mut Visited<'a>,
         mut is_hit: impl FnMut(f32) -> bool,
     ) -> Option<Hit<F>> {
         while bounds.contains(walk.cell) && visited.steps < MAX_STEPS {
@@ -240,13 +310,13 @@ impl<'a, F: Real> Tracer<'a, F> {
         ray: &Ray<F>,
         bounds: Box3,
         mut walk: Walk<F>,
-        visited: &mut Visited,
+        visited: &mut Visited<'a>,
     ) -> Option<Hit<F>> {
         let mut negative = self.sign_before(&walk);
         while bounds.contains(walk.cell) && visited.steps < MAX_STEPS {
             visited.steps += 1;
             let (node, constant, value) = self.node(walk.cell, visited);
-            let alone = constant && self.skips() && self.frame.is_alone(self.voxel(walk.cell));
+            let alone = constant && self.is_alone(walk.cell, visited);
             let inner = Box3 { min: node.min, max: node.max.map(|v| v - i32::from(!alone)) };
             if constant && inner.contains(walk.cell) {
                 let sign = value < 0.0;
@@ -287,10 +357,24 @@ impl<'a, F: Real> Tracer<'a, F> {
         std::array::from_fn(|a| ray.origin[a] - F::from_i32(cell[a]) + ray.direction[a] * t)
     }
 
+    fn is_alone(&self, cell: [i32; 3], visited: &mut Visited<'a>) -> bool {
+        self.skips() && self.frame.is_alone(self.voxel(cell), &mut visited.nearby)
+    }
+
     /// The voxels at a cell's corners, ordered by x + 2y + 4z.
-    fn corners(&self, cell: [i32; 3], visited: &mut Visited) -> [F; 8] {
+    fn corners(&self, cell: [i32; 3], visited: &mut Visited<'a>) -> [F; 8] {
+        let first = self.voxel(cell);
+        let corner = |i: usize| std::array::from_fn(|a| (i >> a & 1) as i32);
+        // Most cells lie in one brick.
+        if first.0.iter().all(|v| v & (BRICK_DIM - 1) < BRICK_DIM - 1)
+            && let Content::Brick(brick) = self.frame.find(first, &mut visited.nearby).content
+        {
+            visited.varies |= brick.uncertainty > 0.0;
+            let value = |i| self.brick_value(brick, first.offset_by(corner(i)));
+            return std::array::from_fn(|i| F::from_f64(value(i).into()));
+        }
         std::array::from_fn(|i| {
-            let corner = std::array::from_fn(|a| cell[a] + (i >> a & 1) as i32);
+            let corner = std::array::from_fn(|a| cell[a] + corner(i)[a]);
             let (_, _, value) = self.node(corner, visited);
             F::from_f64(value.into())
         })
@@ -307,7 +391,7 @@ impl<'a, F: Real> Tracer<'a, F> {
         })
     }
 
-    fn surface_hit(&self, ray: &Ray<F>, walk: &Walk<F>, t: F, visited: &mut Visited) -> Hit<F> {
+    fn surface_hit(&self, ray: &Ray<F>, walk: &Walk<F>, t: F, visited: &mut Visited<'a>) -> Hit<F> {
         let c = self.perturbed(self.corners(walk.cell, visited), walk.cell).map(Real::to_f64);
         let p = self.local(ray, walk.cell, t).map(|v| v.to_f64().clamp(0.0, 1.0));
         let gradient: [f64; 3] = std::array::from_fn(|a| {
@@ -324,7 +408,7 @@ impl<'a, F: Real> Tracer<'a, F> {
         Hit { t, cell: walk.cell, normal: Some(normalise(world)), axis: walk.axis, value: 1.0 }
     }
 
-    fn shade(&self, ray: &Ray<F>, hit: Option<Hit<F>>, visited: &mut Visited) -> [f32; 3] {
+    fn shade(&self, ray: &Ray<F>, hit: Option<Hit<F>>, visited: &mut Visited<'a>) -> [f32; 3] {
         let Some(hit) = hit else {
             return if self.scene.mode == Mode::Depth { [-1.0; 3] } else { [0.0; 3] };
         };
@@ -350,7 +434,7 @@ impl<'a, F: Real> Tracer<'a, F> {
         })
     }
 
-    fn lit(&self, ray: &Ray<F>, hit: &Hit<F>, visited: &mut Visited) -> f64 {
+    fn lit(&self, ray: &Ray<F>, hit: &Hit<F>, visited: &mut Visited<'a>) -> f64 {
         let normal = self.normal(ray, hit);
         let facing = dot(normal, self.setup.sun_world);
         if facing <= 0.0 {

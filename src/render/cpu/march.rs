@@ -1,0 +1,245 @@
+//! Fog between its voxels, in equal steps, and its light: the twin of `shaders/march.wgsl`.
+//!
+//! A sample takes its light from a sun, whose way through the fog was measured before on a [`LightGrid`], from a sky that
+//! is the same everywhere, and from what glows. Scattering is single, with the phase function of Henyey and Greenstein
+//! ("Diffuse radiation in the galaxy", 1941). A step's own absorption is integrated exactly, as by Hillaire ("Physically
+//! based sky, atmosphere and cloud rendering in Frostbite", 2016), so that light does not depend on the step's length.
+
+use rayon::prelude::*;
+
+use super::{MAX_STEPS, Tracer, Visited};
+use crate::render::Mode;
+use crate::render::camera::dot;
+use crate::render::decoded_frame::Content;
+use crate::render::image::BACKDROP;
+use crate::render::scene::RAMP_STEPS;
+use crate::render::traverse::{Box3, Ray, Real, Walk};
+use crate::volume::{BRICK_DIM, Coord};
+
+/// Optical depth at which a ray ends: what is behind is dimmed to a thousandth, under a half of what 8 bits tell apart.
+const OPAQUE: f64 = 7.0;
+/// A step's optical depth under which what glows in it is taken as not dimmed: there the exact form divides 0 by 0.
+const CLEAR: f64 = 1e-4;
+
+/// For points on a lattice, the optical depth from there to the sun. Fog is lit by what it has between these.
+pub struct LightGrid<F> {
+    /// x fastest.
+    depths: Vec<F>,
+}
+
+/// Where the samples of a ray lie.
+struct Samples<F> {
+    /// How far apart, in `t`.
+    step: F,
+    /// Where the first may lie, in steps.
+    first: F,
+}
+
+impl<F: Real> Samples<F> {
+    fn at(&self, number: F) -> F {
+        (number + self.first) * self.step
+    }
+
+    /// The first that is not before `t`.
+    fn not_before(&self, t: F) -> F {
+        let place = t / self.step - self.first;
+        -F::from_i32((-place).floor_i32())
+    }
+}
+
+impl<'a, F: Real> Tracer<'a, F> {
+    /// The lattice for a picture that needs one.
+    pub fn light_grid(&self) -> Option<LightGrid<F>> {
+        if self.scene.level_set || self.scene.mode != Mode::Lit {
+            return None;
+        }
+        let [x, y, z] = self.setup.light_points;
+        let depth = |i: usize| {
+            let point = [i % x, i / x % y, i / (x * y)];
+            let half = F::from_f64(0.5);
+            // Voxels are the cells around their places here.
+            let origin = std::array::from_fn(|a| {
+                F::from_i32(self.setup.bounds.min[a] + point[a] as i32 * self.setup.light_spacing) + half
+            });
+            let ray = Ray::new(origin, self.setup.to_sun.map(F::from_f64));
+            self.optical_depth(&ray, &mut Visited::default()) * self.extinction
+        };
+        Some(LightGrid { depths: (0..x * y * z).into_par_iter().map(depth).collect() })
+    }
+
+    /// Where a pixel's first sample may lie, in steps: in the middle of the step, or anywhere in it.
+    pub fn first_sample(&self, x: u32, y: u32) -> F {
+        if !self.scene.march.jitter {
+            return F::from_f64(0.5);
+        }
+        let mut h = y.wrapping_mul(self.scene.size[0]).wrapping_add(x);
+        // The hash "lowbias32" of Wellons ("Prospecting for hash functions", 2018).
+        h = (h ^ h >> 16).wrapping_mul(0x7feb_352d);
+        h = (h ^ h >> 15).wrapping_mul(0x846c_a68b);
+        h ^= h >> 16;
+        F::from_i32((h >> 8) as i32) * F::from_f64(1.0 / f64::from(1 << 24))
+    }
+
+    fn samples(&self, ray: &Ray<F>, first: F) -> Samples<F> {
+        let [x, y, z] = ray.direction;
+        let step = F::from_f64(self.setup.step);
+        let step = if self.setup.step_in_cells { step / (x * x + y * y + z * z).sqrt() } else { step };
+        Samples { step, first }
+    }
+
+    /// Samples the fog along a ray: calls `sample` with where on the ray and what is there, until that says no. Nothing is
+    /// told of regions that are empty.
+    fn march(
+        &self,
+        ray: &Ray<F>,
+        samples: &Samples<F>,
+        visited: &mut Visited<'a>,
+        mut sample: impl FnMut(F, F, &mut Visited<'a>) -> bool,
+    ) {
+        let bounds = self.setup.bounds;
+        let Some(mut walk) = Walk::enter(ray, bounds) else { return };
+        let mut next = samples.not_before(walk.t);
+        while bounds.contains(walk.cell) && visited.steps < MAX_STEPS {
+            visited.steps += 1;
+            let (node, constant, value) = self.node(walk.cell, visited);
+            // A cell reaches over to the next voxels: the last layer of a node's cells is not of one value, unless all
+            // around is background too.
+            let alone = constant && self.is_alone(walk.cell, visited);
+            let inner = Box3 { min: node.min, max: node.max.map(|v| v - i32::from(!alone)) };
+            let is_inner = constant && inner.contains(walk.cell);
+            let region = if is_inner { inner } else { self.block(walk.cell) }.within(bounds);
+            walk.leave(ray, region);
+            if is_inner && value <= 0.0 && self.emission.is_none() {
+                next = samples.not_before(walk.t);
+                continue;
+            }
+            while samples.at(next) < walk.t && visited.steps < MAX_STEPS {
+                visited.steps += 1;
+                let t = samples.at(next);
+                let value =
+                    if is_inner { F::from_f64(value.into()) } else { self.between(ray, t, region, visited) };
+                if !sample(t, value, visited) {
+                    return;
+                }
+                next = next + F::from_i32(1);
+            }
+        }
+    }
+
+    /// The 8³ cells around a cell whose first corners lie in one brick.
+    fn block(&self, cell: [i32; 3]) -> Box3 {
+        let voxel = self.voxel(cell).align_down(BRICK_DIM);
+        Box3::cube(std::array::from_fn(|a| voxel.0[a] - self.setup.base[a]), BRICK_DIM)
+    }
+
+    /// The fog at a place on a ray that lies in a region, or beside it by a rounding.
+    fn between(&self, ray: &Ray<F>, t: F, region: Box3, visited: &mut Visited<'a>) -> F {
+        let p: [F; 3] = std::array::from_fn(|a| ray.origin[a] + ray.direction[a] * t);
+        let cell = std::array::from_fn(|a| p[a].floor_i32().clamp(region.min[a], region.max[a] - 1));
+        let within = std::array::from_fn(|a| p[a] - F::from_i32(cell[a]));
+        interpolate(self.corners(cell, visited), within)
+    }
+
+    /// The integral of density over distance, from samples. It ends where the fog is opaque.
+    pub fn marched_depth(&self, ray: &Ray<F>, first: F, visited: &mut Visited<'a>) -> F {
+        let zero = F::from_i32(0);
+        let samples = self.samples(ray, first);
+        let mut depth = zero;
+        self.march(ray, &samples, visited, |_, value, _| {
+            depth = depth + if value > zero { value * samples.step } else { zero };
+            depth * self.extinction < F::from_f64(OPAQUE)
+        });
+        depth
+    }
+
+    /// The light of a ray through fog, with what is behind the fog.
+    pub fn lit_fog(&self, ray: &Ray<F>, first: F, visited: &mut Visited<'a>) -> [f32; 3] {
+        let zero = F::from_i32(0);
+        let one = F::from_i32(1);
+        let color = |c: [f64; 3]| c.map(F::from_f64);
+        let samples = self.samples(ray, first);
+        let phase = self.phase(ray);
+        let sun = color(self.setup.sun_light).map(|c| c * phase);
+        let sky = color(self.setup.sky_light);
+        let mut light = [zero; 3];
+        let mut depth = zero;
+        let mut through = one;
+        self.march(ray, &samples, visited, |t, value, visited| {
+            let p: [F; 3] = std::array::from_fn(|a| ray.origin[a] + ray.direction[a] * t);
+            let thickness = if value > zero { value * samples.step * self.extinction } else { zero };
+            depth = depth + thickness;
+            let left = (-depth).exp();
+            if thickness > zero {
+                let sunlight = (-self.depth_to_sun(p)).exp();
+                light = std::array::from_fn(|c| light[c] + (through - left) * (sun[c] * sunlight + sky[c]));
+            }
+            if let Some(glow) = self.glow(p, visited) {
+                let clear = thickness < F::from_f64(CLEAR);
+                let seen = samples.step * if clear { through } else { (through - left) / thickness };
+                light = std::array::from_fn(|c| light[c] + glow[c] * seen);
+            }
+            through = left;
+            depth < F::from_f64(OPAQUE)
+        });
+        std::array::from_fn(|c| light[c].to_f64() as f32 + through.to_f64() as f32 * BACKDROP[c])
+    }
+
+    /// Henyey and Greenstein's phase function for light from the sun, as a multiple of what scatters alike everywhere.
+    fn phase(&self, ray: &Ray<F>) -> F {
+        let g = self.scene.light.anisotropy;
+        let cosine = dot(ray.direction.map(Real::to_f64), self.setup.sun_cosine);
+        F::from_f64((1.0 - g * g) / (1.0 + g * g - 2.0 * g * cosine).powf(1.5))
+    }
+
+    /// The optical depth from a place to the sun.
+    fn depth_to_sun(&self, p: [F; 3]) -> F {
+        let Some(light) = self.light else { return F::from_i32(0) };
+        let points = self.setup.light_points;
+        let spacing = F::from_i32(self.setup.light_spacing);
+        let place: [F; 3] = std::array::from_fn(|a| (p[a] - F::from_i32(self.setup.bounds.min[a])) / spacing);
+        let low: [usize; 3] =
+            std::array::from_fn(|a| place[a].floor_i32().clamp(0, points[a] as i32 - 2) as usize);
+        let within = std::array::from_fn(|a| place[a] - F::from_i32(low[a] as i32));
+        let corner = |i: usize| {
+            let [x, y, z]: [usize; 3] = std::array::from_fn(|a| low[a] + (i >> a & 1));
+            light.depths[(z * points[1] + y) * points[0] + x]
+        };
+        interpolate(std::array::from_fn(corner), within)
+    }
+
+    /// What glows at a place.
+    fn glow(&self, p: [F; 3], visited: &mut Visited<'a>) -> Option<[F; 3]> {
+        let (emission, frame) = self.scene.emission.as_ref().zip(self.emission)?;
+        let rows = self.setup.to_emission.map(|row| row.map(F::from_f64));
+        let at: [F; 3] =
+            std::array::from_fn(|a| rows[a][0] * p[0] + rows[a][1] * p[1] + rows[a][2] * p[2] + rows[a][3]);
+        let cell = at.map(Real::floor_i32);
+        let within = std::array::from_fn(|a| at[a] - F::from_i32(cell[a]));
+        let value = |i: usize| {
+            let corner = Coord(std::array::from_fn(|a| cell[a].wrapping_add((i >> a & 1) as i32)));
+            let value = match frame.find(corner, &mut visited.emission_nearby).content {
+                Content::Constant(constant) => constant.value,
+                Content::Brick(brick) => brick.values[corner.child_index(3, 1)],
+            };
+            F::from_f64(value.into())
+        };
+        let value = interpolate(std::array::from_fn(value), within) * F::from_f64(emission.per_unit);
+        let place = value * F::from_i32(RAMP_STEPS as i32 - 1);
+        if !(place > F::from_i32(0)) {
+            return None;
+        }
+        let low = place.floor_i32().min(RAMP_STEPS as i32 - 2);
+        let part = place - F::from_i32(low);
+        let part = if part < F::from_i32(1) { part } else { F::from_i32(1) };
+        let color = |i: usize, c: usize| F::from_f64(emission.ramp[i][c].into());
+        let low = low as usize;
+        Some(std::array::from_fn(|c| color(low, c) * (F::from_i32(1) - part) + color(low + 1, c) * part))
+    }
+}
+
+/// Between eight values, ordered by x + 2y + 4z.
+fn interpolate<F: Real>(v: [F; 8], [x, y, z]: [F; 3]) -> F {
+    let mix = |a: F, b: F, part: F| a * (F::from_i32(1) - part) + b * part;
+    let over_z: [F; 4] = std::array::from_fn(|i| mix(v[i], v[i + 4], z));
+    mix(mix(over_z[0], over_z[2], y), mix(over_z[1], over_z[3], y), x)
+}
