@@ -1,4 +1,4 @@
-//! The colour of what glows.
+//! The colour of a black body.
 
 /// Planck's second radiation constant hc/k, in nanometre kelvins (CODATA 2018).
 const C2: f64 = 1.438_776_877e7;

@@ -67,8 +67,8 @@ pub enum Up {
 }
 
 impl Up {
-    /// A guess from a box, since a pack does not say: what spreads and rises is about as wide as it is deep, so up is the
-    /// one of y and z across which the box is more nearly square; y where that is the same.
+    /// A guess from the shape, because a pack does not contain the axis. Smoke, clouds and explosions are about as wide as
+    /// they are deep, so up is the one of y and z around which the box is closer to a square; y if both are equal.
     pub fn of_box(bounds: &WorldBox) -> Self {
         let [x, y, z] = bounds.size();
         let unlike = |a: f64, b: f64| a.max(b) / a.min(b);

@@ -238,6 +238,7 @@ impl DecodedFrame {
         let found = |content, dim: i32| Found { content, origin: at.align_down(dim), dim };
         let background = Content::Constant(Constant { value: self.background, active: false });
         match self.cell(at, nearby) {
+            None if self.roots.is_empty() => found(background, L2_DIM),
             None => match self.roots.get(&at.align_down(L1_DIM)) {
                 Some(root) => found(Content::Constant(*root), L1_DIM),
                 None => found(background, L2_DIM),

@@ -74,10 +74,10 @@ pub fn apart(a: &[f32], b: &[f32]) -> f32 {
     a.iter().zip(b).map(apart).fold(0.0, f32::max)
 }
 
-/// Where bright light begins to be compressed.
+/// Radiance above which the tone curve flattens.
 const SHOULDER: f32 = 0.7;
 
-/// Light as it is shown: what is bright nears 1 and never reaches it, so that a fire does not turn into a white spot.
+/// The tone curve of lit fog: linear, then flattening towards 1, so that a fire does not clip to white.
 fn shoulder(v: f32) -> f32 {
     let over = (v - SHOULDER).max(0.0) / (1.0 - SHOULDER);
     v.min(SHOULDER) + (1.0 - SHOULDER) * (over / (1.0 + over))

@@ -56,7 +56,7 @@ pub enum Mode {
     Nodes,
     /// The normal of the face through which the first hit was entered; level sets: of the surface
     Normals,
-    /// In the sun, with its own shadow; fog also scatters light and glows
+    /// Lit by a sun, with shadows; fog: single scattering and emission
     Lit,
 }
 
@@ -73,7 +73,7 @@ impl Mode {
         Self::Lit,
     ];
 
-    /// What shows most of a grid's data: all of fog, the surface of a level set.
+    /// The mode in which packs are compared with their sources: the opacity of fog, the lit surface of a level set.
     pub fn of_grid(grid: &Grid) -> Self {
         if grid.is_level_set() { Self::Lit } else { Self::Density }
     }
@@ -84,12 +84,12 @@ impl Mode {
     }
 }
 
-/// What a grid is between its voxels.
+/// How a grid is interpolated between voxels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Interpolation {
-    /// What the nearest voxel is: fog is added up exactly, a level set's surface are the faces between voxels of different sign
+    /// The nearest voxel: fog is integrated exactly, voxel by voxel; a level set's surface is made of voxel faces
     Nearest,
-    /// Trilinear between eight voxels, as games sample it: fog is added up in steps, a level set's surface is smooth
+    /// Trilinear, as games sample it: fog is ray-marched in equal steps, a level set's surface is smooth
     Trilinear,
 }
 

@@ -56,8 +56,8 @@ impl<'a> Renderer<'a> {
         }
     }
 
-    /// The same, but what is fastest here for [`Device::Auto`]: software Vulkan is slower than the CPU tracer, and takes
-    /// seconds to start.
+    /// The same, except that [`Device::Auto`] prefers the CPU tracer to software Vulkan, which is slower and takes seconds
+    /// to start.
     ///
     /// # Errors
     /// See [`Renderer::new`].

@@ -23,13 +23,13 @@ pub struct Scene {
     pub matrix: [f64; 16],
     /// Whether the grid's zero is a surface.
     pub level_set: bool,
-    /// What the grid is between its voxels.
+    /// How the grid is interpolated between voxels.
     pub interpolation: Interpolation,
-    /// How rays sample fog between voxels.
+    /// How fog is ray-marched.
     pub march: March,
-    /// How fog is lit.
+    /// The lights of fog.
     pub light: Light,
-    /// What glows in lit fog.
+    /// The emissive grid of lit fog.
     pub emission: Option<Emission>,
     /// Optical depth of a density of 1 over a world unit.
     pub extinction: f64,
@@ -37,7 +37,7 @@ pub struct Scene {
     pub threshold: f32,
 }
 
-/// The distance between two samples.
+/// The step of a ray march.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Step {
     /// In voxels.
@@ -46,51 +46,51 @@ pub enum Step {
     World(f64),
 }
 
-/// How rays sample fog between voxels.
+/// How fog is ray-marched.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct March {
     /// The distance between two samples.
     pub step: Step,
-    /// Whether each pixel's samples begin elsewhere, so that steps are seen as noise and not as rings.
+    /// Whether each pixel's samples are offset by a hash, which turns banding into noise.
     pub jitter: bool,
 }
 
 impl Default for March {
-    /// Half a voxel, as NanoVDB's example does: no voxel is passed over.
+    /// Half a voxel, as in NanoVDB's example, so that no voxel is skipped.
     fn default() -> Self {
         Self { step: Step::Voxels(0.5), jitter: false }
     }
 }
 
-/// A grid whose values glow.
+/// An emissive grid.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Emission {
-    /// Which one of the pack.
+    /// Its place in the pack.
     pub grid: usize,
     /// Its frame.
     pub frame: usize,
     /// Its index space to world space.
     pub matrix: [f64; 16],
-    /// One over the value at which `ramp` ends.
+    /// 1 divided by the value at which `ramp` ends.
     pub per_unit: f64,
-    /// For values from 0 on what glows of it per world unit, in linear sRGB.
+    /// Emission per world unit for values from 0 on, in linear sRGB.
     pub ramp: [[f32; 3]; RAMP_STEPS],
 }
 
-/// Colours of a ramp: on the way from dark red to yellow none is far from the next.
+/// Entries of a ramp, which is interpolated linearly: enough for a smooth change from dark red to yellow.
 pub const RAMP_STEPS: usize = 64;
-/// Radiance of the hottest after a tenth of the box's diagonal: much brighter than fog in the sun, since a fire is seen
-/// through its smoke.
+/// Radiance of the hottest value over a tenth of the box's diagonal. It is much brighter than fog in the sun, because a fire
+/// is seen through its smoke.
 const GLOW: f64 = 20.0;
-/// Values up to here are no temperatures in kelvin.
+/// A grid whose values are all below this is not in kelvin.
 const LEAST_KELVIN: f32 = 100.0;
-/// What the hottest of other values is taken for: a yellow flame.
+/// The temperature of the highest value of such a grid: a yellow flame.
 const FLAME_KELVIN: f64 = 1900.0;
 
 impl Emission {
-    /// The glow of a grid of temperatures, or of flames, whose hottest is yellow. `kelvin` is what a value of 1 stands for.
-    /// Where it is not given, values of thousands are kelvins, and the largest of others is a flame.
-    /// A body glows with the fourth power of its temperature (Stefan and Boltzmann), in a black body's colour.
+    /// The emission of a grid of temperatures or flames: black bodies, whose radiance grows with the fourth power of their
+    /// temperature (Stefan and Boltzmann). `kelvin` is the temperature at value 1. Without it, a grid with values above 100
+    /// is in kelvin, and the highest value of any other grid is a yellow flame.
     ///
     /// # Panics
     /// When there is no such frame.
@@ -136,7 +136,7 @@ impl Scene {
             size,
             matrix: grid.frames[frame].record.transform,
             level_set,
-            // Fog is added up voxel by voxel, which is exact.
+            // Exact for fog.
             interpolation: if level_set { Interpolation::Trilinear } else { Interpolation::Nearest },
             march: March::default(),
             light: Light::default(),
@@ -151,7 +151,7 @@ impl Scene {
         match self.mode {
             _ if self.level_set => self.interpolation == Interpolation::Trilinear,
             Mode::Density => self.interpolation == Interpolation::Trilinear,
-            // Lit fog is seen as games show it.
+            // Lit fog is sampled as games do.
             mode => mode == Mode::Lit,
         }
     }
@@ -163,10 +163,10 @@ const SUN: [f64; 3] = [0.48, 0.80, 0.36];
 pub const AMBIENT: f64 = 0.15;
 /// A shadow ray begins this many cells off the surface, so that the surface does not shade itself.
 const SHADOW_OFFSET: f64 = 1.5;
-/// Voxels between two points of the lattice on which light is measured, where the box is small enough: shadows in fog are
-/// soft, and half as fine takes an eighth of the time.
+/// Voxels between two points of the light grid, if the box is small enough. Shadows in fog are soft, and half the
+/// resolution takes an eighth of the time.
 const LIGHT_SPACING: i32 = 2;
-/// Points of that lattice, at most: 2 MiB, and a second or two of a core.
+/// Maximum number of points of the light grid: 2 MiB, and a second or two of one core.
 const MAX_LIGHT_POINTS: usize = 1 << 19;
 /// Why a frame cannot be traced.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -194,23 +194,23 @@ pub struct Setup {
     pub normals: [[f64; 3]; 3],
     /// Towards the sun of a level set, in world space.
     pub sun_world: [f64; 3],
-    /// The distance between two samples of fog, in world units, or in cells.
+    /// The step of the ray march, in world units or in cells.
     pub step: f64,
-    /// Whether it is in cells.
+    /// Whether the step is in cells.
     pub step_in_cells: bool,
     /// Towards the sun of fog, in cells a world unit.
     pub to_sun: [f64; 3],
-    /// For a ray's direction in cells, what the cosine of its angle with the sun is the product of.
+    /// Its product with a ray's direction in cells is the cosine of the angle between ray and sun.
     pub sun_cosine: [f64; 3],
-    /// What fog scatters of the sun's light, where that is not dimmed.
+    /// Unoccluded sunlight times the albedo.
     pub sun_light: [f64; 3],
-    /// What fog scatters of the sky's light.
+    /// Sky light times the albedo.
     pub sky_light: [f64; 3],
-    /// Cells between two points of the lattice on which light is measured. The first is the box's first corner.
+    /// Cells between two points of the light grid, whose first point is the box's first corner.
     pub light_spacing: i32,
-    /// How many there are along each axis: the last ones lie on the box's end, or behind it.
+    /// Points of the light grid along each axis. The last ones lie on the box's end or behind it.
     pub light_points: [usize; 3],
-    /// Rows whose products with a place in cells, and 1, are the place in the grid that glows.
+    /// Rows of the matrix from cells to the index space of the emissive grid.
     pub to_emission: [[f64; 4]; 3],
 }
 
@@ -243,7 +243,7 @@ impl Setup {
         let sun = sun.map(|v| v * SHADOW_OFFSET / length(sun));
         let fog_sun = scene.light.to_sun(up);
         let row = |r: usize| std::array::from_fn(|c| scene.matrix[4 * r + c]);
-        let (light_spacing, light_points) = light_lattice(bounds);
+        let (light_spacing, light_points) = light_grid(bounds);
         let (step, step_in_cells) = match scene.march.step {
             Step::Voxels(step) => (step, true),
             Step::World(step) => (step, false),
@@ -271,8 +271,8 @@ impl Setup {
     }
 }
 
-/// Spacing and number of points along each axis, for a box.
-fn light_lattice(bounds: Box3) -> (i32, [usize; 3]) {
+/// Spacing of the light grid of a box, and its points along each axis.
+fn light_grid(bounds: Box3) -> (i32, [usize; 3]) {
     let points = |spacing: i32| -> [usize; 3] {
         std::array::from_fn(|a| {
             let cells = (bounds.max[a] - bounds.min[a]).max(1) as usize;
@@ -288,7 +288,7 @@ fn light_lattice(bounds: Box3) -> (i32, [usize; 3]) {
     (spacing, points(spacing))
 }
 
-/// From cells, counted from `base`, of a grid with one matrix to the index space of one with another.
+/// The matrix from the cells of a grid, counted from `base`, to the index space of another grid.
 fn to_emission(from: &[f64; 16], to: &[f64; 16], base: [i32; 3]) -> Result<[[f64; 4]; 3], TraceError> {
     let inverse = invert3(to).ok_or(TraceError::Transform)?;
     let row = |r: usize| [from[4 * r], from[4 * r + 1], from[4 * r + 2]];

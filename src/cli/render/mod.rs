@@ -58,7 +58,7 @@ pub struct RenderArgs {
     /// How rays step through the tree
     #[arg(long, default_value = "hdda")]
     traversal: Traversal,
-    /// What the grid is between its voxels
+    /// Interpolation between voxels
     #[arg(long, default_value = "trilinear")]
     interpolation: Interpolation,
     #[command(flatten)]
@@ -69,34 +69,34 @@ pub struct RenderArgs {
 #[derive(Args)]
 #[command(next_help_heading = "Fog")]
 struct FogArgs {
-    /// Distance between two samples: 0.5 is in voxels, 0.02world in world units
+    /// Step of the ray march: 0.5 is in voxels, 0.02world in world units
     #[arg(long, value_name = "STEP", default_value = "0.5", value_parser = step)]
     step: Step,
-    /// Begin each pixel's samples at another place, so that steps are seen as noise
+    /// Offset each pixel's samples by a hash, which turns banding into noise
     #[arg(long)]
     jitter: bool,
-    /// Optical depth of a density of 1 over a world unit [default: lit, 3 in the middle of what is covered; else 24 through the box at its highest density]
+    /// Extinction: optical depth per world unit at density 1 [default: with --mode lit, half of the covered pixels have an optical depth above 3; otherwise, the highest density has 24 across the box]
     #[arg(long, value_name = "X", value_parser = super::above_zero)]
     extinction: Option<f64>,
-    /// Where the sun stands, in degrees [default: 110,40, to the right of a default camera]
+    /// Direction of the sun in degrees [default: 110,40]
     #[arg(long, value_name = "AZIMUTH,ELEVATION", allow_hyphen_values = true, value_parser = sun)]
     sun: Option<[f64; 2]>,
-    /// Part of the light that fog scatters, 0 to 1 [default: 0.95; 0.6 where something glows]
+    /// Scattering albedo, 0 to 1 [default: 0.95; 0.6 with an emissive grid]
     #[arg(long, value_name = "PART", value_parser = part)]
     albedo: Option<f64>,
-    /// Where fog scatters light to: -0.99 back, 0 everywhere, 0.99 onwards
+    /// Anisotropy of scattering (g of Henyey and Greenstein): -0.99 backward, 0 isotropic, 0.99 forward
     #[arg(long, value_name = "G", default_value_t = Light::default().anisotropy, allow_negative_numbers = true, value_parser = anisotropy)]
     anisotropy: f64,
-    /// Brightness of the sky
+    /// Ambient light from the sky, as a factor
     #[arg(long, value_name = "X", default_value_t = Light::default().ambient, value_parser = not_below_zero)]
     ambient: f64,
-    /// Grid that glows, or none [default: flame, or temperature, if the pack has it]
+    /// Emissive grid, or none [default: flame or temperature, if the pack has it]
     #[arg(long, value_name = "GRID")]
     emission: Option<String>,
-    /// Brightness of what glows
+    /// Brightness of the emission, as a factor
     #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = not_below_zero)]
-    glow: f64,
-    /// Kelvins of a value of 1 in the grid that glows [default: 1 if it has values above 100, else its highest is 1900 K]
+    emission_strength: f64,
+    /// Temperature at value 1 of the emissive grid, in kelvin [default: 1 if the grid has values above 100; otherwise, its highest value is 1900 K]
     #[arg(long, value_name = "K", value_parser = super::above_zero)]
     kelvin: Option<f64>,
 }
@@ -172,7 +172,7 @@ pub fn run(args: &RenderArgs, common: Common) -> Result<()> {
     let wrong = |what: String| Error::Usage(format!("{}: {what}", args.pack.display()));
     let grid = args.grid.as_deref().map_or(Ok(0), |name| named(pack.grids(), name)).map_err(wrong)?;
     let frames = frames(args, &pack.grids()[grid].frames).map_err(wrong)?;
-    let glowing = glowing(args, pack.grids(), grid).map_err(wrong)?;
+    let emissive = emissive(args, pack.grids(), grid).map_err(wrong)?;
     let renderer = Renderer::fastest(&pack, args.device).map_err(|e| gpu_error(e, &args.pack))?;
     if !common.quiet {
         let why = renderer.fallback.as_ref().map(|why| format!(" ({why})")).unwrap_or_default();
@@ -191,7 +191,7 @@ pub fn run(args: &RenderArgs, common: Common) -> Result<()> {
         say(&|reporter| reporter.stage("rendering", frames.len() as u64, "frames"));
     }
     let draw = |&frame: &usize| -> Result<(Picture, f64)> {
-        let scene = scene(args, pack.grids(), [grid, frame], glowing);
+        let scene = scene(args, pack.grids(), [grid, frame], emissive);
         let scene = Scene { extinction: extinction.unwrap_or(scene.extinction), ..scene };
         let image = renderer.render(grid, frame, &scene).map_err(|e| gpu_error(e, &args.pack))?;
         say(&|reporter| reporter.advance(1));
@@ -228,19 +228,18 @@ fn frames(args: &RenderArgs, all: &[Frame]) -> std::result::Result<Vec<usize>, S
     }
 }
 
-/// Grids that glow, by the names that Blender, Houdini and EmberGen give them. A flame tells more than a temperature, which
-/// smoke has too.
-const GLOWING: [&str; 7] = ["flame", "flames", "fire", "burn", "temperature", "temp", "heat"];
+/// Names of emissive grids in Blender, Houdini and EmberGen. Flames come first, because cool smoke has a temperature too.
+const EMISSIVE: [&str; 7] = ["flame", "flames", "fire", "burn", "temperature", "temp", "heat"];
 
-/// The grid that glows in lit fog.
-fn glowing(args: &RenderArgs, grids: &[Grid], shown: usize) -> std::result::Result<Option<usize>, String> {
+/// The emissive grid of lit fog.
+fn emissive(args: &RenderArgs, grids: &[Grid], shown: usize) -> std::result::Result<Option<usize>, String> {
     if args.mode != Mode::Lit || grids[shown].is_level_set() {
         return Ok(None);
     }
     match args.fog.emission.as_deref() {
         Some("none") => Ok(None),
         Some(name) => named(grids, name).map(Some),
-        None => Ok(GLOWING
+        None => Ok(EMISSIVE
             .iter()
             .find_map(|name| {
                 grids
@@ -251,13 +250,13 @@ fn glowing(args: &RenderArgs, grids: &[Grid], shown: usize) -> std::result::Resu
     }
 }
 
-fn scene(args: &RenderArgs, grids: &[Grid], [grid, frame]: [usize; 2], glowing: Option<usize>) -> Scene {
+fn scene(args: &RenderArgs, grids: &[Grid], [grid, frame]: [usize; 2], emissive: Option<usize>) -> Scene {
     let usual = Scene::new(&grids[grid], frame, &args.camera, args.mode, args.size);
     let fog = &args.fog;
     let number = grids[grid].frames[frame].record.number;
-    let emission = glowing.and_then(|other| {
+    let emission = emissive.and_then(|other| {
         let frame = grids[other].frames.iter().position(|frame| frame.record.number == number)?;
-        Some(Emission::new(grids, other, frame, fog.kelvin, fog.glow))
+        Some(Emission::new(grids, other, frame, fog.kelvin, fog.emission_strength))
     });
     let usual_albedo = if emission.is_some() { SOOTY_ALBEDO } else { Light::default().albedo };
     Scene {

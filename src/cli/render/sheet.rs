@@ -44,9 +44,9 @@ const GLYPHS: [[u8; 5]; 11] = [
 ];
 const MINUS: usize = 10;
 
-/// Draws a number into the lower left corner, as high as a fiftieth of the picture, where it has room.
+/// Draws a number into the lower left corner, a twenty-fifth of the picture's height, if there is room.
 fn write_number(rgb: &mut [u8], [width, height]: [u32; 2], number: i32) {
-    let scale = (height / 250).max(1);
+    let scale = (height / 125).max(1);
     let text = number.to_string();
     let (wide, high) = (text.len() as u32 * 4 * scale, 5 * scale);
     let (left, top) = (2 * scale, height.saturating_sub(high + 2 * scale));

@@ -1,9 +1,9 @@
-//! Fog between its voxels, in equal steps, and its light: the twin of `shaders/march.wgsl`.
+//! The ray march through lit fog, the twin of `shaders/march.wgsl`.
 //!
-//! A sample takes its light from a sun, whose way through the fog was measured before on a [`LightGrid`], from a sky that
-//! is the same everywhere, and from what glows. Scattering is single, with the phase function of Henyey and Greenstein
-//! ("Diffuse radiation in the galaxy", 1941). A step's own absorption is integrated exactly, as by Hillaire ("Physically
-//! based sky, atmosphere and cloud rendering in Frostbite", 2016), so that light does not depend on the step's length.
+//! Each sample scatters light from a sun, whose optical depth is precomputed on a [`LightGrid`], and from a constant sky, and
+//! adds the emission of another grid. Scattering is single, with the phase function of Henyey and Greenstein ("Diffuse
+//! radiation in the galaxy", 1941). Absorption within a step is integrated analytically (Hillaire, "Physically based sky,
+//! atmosphere and cloud rendering in Frostbite", 2016), so that brightness does not depend on the step.
 
 use rayon::prelude::*;
 
@@ -16,59 +16,63 @@ use crate::render::scene::RAMP_STEPS;
 use crate::render::traverse::{Box3, Ray, Real, Walk};
 use crate::volume::{BRICK_DIM, Coord};
 
-/// Optical depth at which a ray ends: what is behind is dimmed to a thousandth, under a half of what 8 bits tell apart.
+/// Optical depth at which a ray ends. The transmittance is then 0.001, below half of an 8-bit step.
 const OPAQUE: f64 = 7.0;
-/// A step's optical depth under which what glows in it is taken as not dimmed: there the exact form divides 0 by 0.
+/// Optical depth of a step below which its own absorption of emission is neglected: the exact form would divide 0 by 0.
 const CLEAR: f64 = 1e-4;
 
-/// For points on a lattice, the optical depth from there to the sun. Fog is lit by what it has between these.
+/// Optical depth towards the sun on a regular grid of points; interpolated between them.
 pub struct LightGrid<F> {
     /// x fastest.
     depths: Vec<F>,
 }
 
-/// Where the samples of a ray lie.
+/// The sample positions of a ray: `t = (number + offset) · step`.
 struct Samples<F> {
-    /// How far apart, in `t`.
     step: F,
-    /// Where the first may lie, in steps.
-    first: F,
+    offset: F,
 }
 
 impl<F: Real> Samples<F> {
     fn at(&self, number: F) -> F {
-        (number + self.first) * self.step
+        (number + self.offset) * self.step
     }
 
-    /// The first that is not before `t`.
+    /// The number of the first sample that is not before `t`.
     fn not_before(&self, t: F) -> F {
-        let place = t / self.step - self.first;
+        let place = t / self.step - self.offset;
         -F::from_i32((-place).floor_i32())
     }
 }
 
 impl<'a, F: Real> Tracer<'a, F> {
-    /// The lattice for a picture that needs one.
+    /// The light grid, if the picture needs one.
     pub fn light_grid(&self) -> Option<LightGrid<F>> {
         if self.scene.level_set || self.scene.mode != Mode::Lit {
             return None;
         }
         let [x, y, z] = self.setup.light_points;
-        let depth = |i: usize| {
-            let point = [i % x, i / x % y, i / (x * y)];
+        let row = |row: usize| {
+            // Points of a row are near each other.
+            let mut visited = Visited::default();
             let half = F::from_f64(0.5);
-            // Voxels are the cells around their places here.
-            let origin = std::array::from_fn(|a| {
-                F::from_i32(self.setup.bounds.min[a] + point[a] as i32 * self.setup.light_spacing) + half
-            });
-            let ray = Ray::new(origin, self.setup.to_sun.map(F::from_f64));
-            self.optical_depth(&ray, &mut Visited::default()) * self.extinction
+            let depth = move |column: usize| {
+                let point = [column, row % y, row / y];
+                // Here cell i is the voxel around i.
+                let origin = std::array::from_fn(|a| {
+                    F::from_i32(self.setup.bounds.min[a] + point[a] as i32 * self.setup.light_spacing) + half
+                });
+                visited.steps = 0;
+                let ray = Ray::new(origin, self.setup.to_sun.map(F::from_f64));
+                self.optical_depth(&ray, &mut visited) * self.extinction
+            };
+            (0..x).map(depth)
         };
-        Some(LightGrid { depths: (0..x * y * z).into_par_iter().map(depth).collect() })
+        Some(LightGrid { depths: (0..y * z).into_par_iter().flat_map_iter(row).collect() })
     }
 
-    /// Where a pixel's first sample may lie, in steps: in the middle of the step, or anywhere in it.
-    pub fn first_sample(&self, x: u32, y: u32) -> F {
+    /// The offset of a pixel's samples, in steps: 0.5, or a hash of the pixel.
+    pub fn sample_offset(&self, x: u32, y: u32) -> F {
         if !self.scene.march.jitter {
             return F::from_f64(0.5);
         }
@@ -80,15 +84,15 @@ impl<'a, F: Real> Tracer<'a, F> {
         F::from_i32((h >> 8) as i32) * F::from_f64(1.0 / f64::from(1 << 24))
     }
 
-    fn samples(&self, ray: &Ray<F>, first: F) -> Samples<F> {
+    fn samples(&self, ray: &Ray<F>, offset: F) -> Samples<F> {
         let [x, y, z] = ray.direction;
         let step = F::from_f64(self.setup.step);
         let step = if self.setup.step_in_cells { step / (x * x + y * y + z * z).sqrt() } else { step };
-        Samples { step, first }
+        Samples { step, offset }
     }
 
-    /// Samples the fog along a ray: calls `sample` with where on the ray and what is there, until that says no. Nothing is
-    /// told of regions that are empty.
+    /// Calls `sample` with `t` and density of each sample along a ray, until it returns false. Empty regions are skipped,
+    /// unless there is emission.
     fn march(
         &self,
         ray: &Ray<F>,
@@ -102,8 +106,8 @@ impl<'a, F: Real> Tracer<'a, F> {
         while bounds.contains(walk.cell) && visited.steps < MAX_STEPS {
             visited.steps += 1;
             let (node, constant, value) = self.node(walk.cell, visited);
-            // A cell reaches over to the next voxels: the last layer of a node's cells is not of one value, unless all
-            // around is background too.
+            // A cell has the next voxels as corners, so the last layer of a node's cells is not constant, unless the nodes
+            // around it are background too.
             let alone = constant && self.is_alone(walk.cell, visited);
             let inner = Box3 { min: node.min, max: node.max.map(|v| v - i32::from(!alone)) };
             let is_inner = constant && inner.contains(walk.cell);
@@ -126,13 +130,13 @@ impl<'a, F: Real> Tracer<'a, F> {
         }
     }
 
-    /// The 8³ cells around a cell whose first corners lie in one brick.
+    /// The block of 8³ cells around a cell.
     fn block(&self, cell: [i32; 3]) -> Box3 {
         let voxel = self.voxel(cell).align_down(BRICK_DIM);
         Box3::cube(std::array::from_fn(|a| voxel.0[a] - self.setup.base[a]), BRICK_DIM)
     }
 
-    /// The fog at a place on a ray that lies in a region, or beside it by a rounding.
+    /// The interpolated density at `t`. Rounding may put it just outside the region.
     fn between(&self, ray: &Ray<F>, t: F, region: Box3, visited: &mut Visited<'a>) -> F {
         let p: [F; 3] = std::array::from_fn(|a| ray.origin[a] + ray.direction[a] * t);
         let cell = std::array::from_fn(|a| p[a].floor_i32().clamp(region.min[a], region.max[a] - 1));
@@ -140,10 +144,10 @@ impl<'a, F: Real> Tracer<'a, F> {
         interpolate(self.corners(cell, visited), within)
     }
 
-    /// The integral of density over distance, from samples. It ends where the fog is opaque.
-    pub fn marched_depth(&self, ray: &Ray<F>, first: F, visited: &mut Visited<'a>) -> F {
+    /// The ray-marched integral of density over distance, up to where the fog is opaque.
+    pub fn marched_depth(&self, ray: &Ray<F>, offset: F, visited: &mut Visited<'a>) -> F {
         let zero = F::from_i32(0);
-        let samples = self.samples(ray, first);
+        let samples = self.samples(ray, offset);
         let mut depth = zero;
         self.march(ray, &samples, visited, |_, value, _| {
             depth = depth + if value > zero { value * samples.step } else { zero };
@@ -152,12 +156,12 @@ impl<'a, F: Real> Tracer<'a, F> {
         depth
     }
 
-    /// The light of a ray through fog, with what is behind the fog.
-    pub fn lit_fog(&self, ray: &Ray<F>, first: F, visited: &mut Visited<'a>) -> [f32; 3] {
+    /// The radiance of a ray through lit fog in front of the backdrop.
+    pub fn lit_fog(&self, ray: &Ray<F>, offset: F, visited: &mut Visited<'a>) -> [f32; 3] {
         let zero = F::from_i32(0);
         let one = F::from_i32(1);
         let color = |c: [f64; 3]| c.map(F::from_f64);
-        let samples = self.samples(ray, first);
+        let samples = self.samples(ray, offset);
         let phase = self.phase(ray);
         let sun = color(self.setup.sun_light).map(|c| c * phase);
         let sky = color(self.setup.sky_light);
@@ -173,10 +177,10 @@ impl<'a, F: Real> Tracer<'a, F> {
                 let sunlight = (-self.depth_to_sun(p)).exp();
                 light = std::array::from_fn(|c| light[c] + (through - left) * (sun[c] * sunlight + sky[c]));
             }
-            if let Some(glow) = self.glow(p, visited) {
+            if let Some(emission) = self.emission_at(p, visited) {
                 let clear = thickness < F::from_f64(CLEAR);
                 let seen = samples.step * if clear { through } else { (through - left) / thickness };
-                light = std::array::from_fn(|c| light[c] + glow[c] * seen);
+                light = std::array::from_fn(|c| light[c] + emission[c] * seen);
             }
             through = left;
             depth < F::from_f64(OPAQUE)
@@ -184,14 +188,14 @@ impl<'a, F: Real> Tracer<'a, F> {
         std::array::from_fn(|c| light[c].to_f64() as f32 + through.to_f64() as f32 * BACKDROP[c])
     }
 
-    /// Henyey and Greenstein's phase function for light from the sun, as a multiple of what scatters alike everywhere.
+    /// The phase function for sunlight, relative to isotropic scattering.
     fn phase(&self, ray: &Ray<F>) -> F {
         let g = self.scene.light.anisotropy;
         let cosine = dot(ray.direction.map(Real::to_f64), self.setup.sun_cosine);
         F::from_f64((1.0 - g * g) / (1.0 + g * g - 2.0 * g * cosine).powf(1.5))
     }
 
-    /// The optical depth from a place to the sun.
+    /// The optical depth from a point to the sun.
     fn depth_to_sun(&self, p: [F; 3]) -> F {
         let Some(light) = self.light else { return F::from_i32(0) };
         let points = self.setup.light_points;
@@ -207,8 +211,8 @@ impl<'a, F: Real> Tracer<'a, F> {
         interpolate(std::array::from_fn(corner), within)
     }
 
-    /// What glows at a place.
-    fn glow(&self, p: [F; 3], visited: &mut Visited<'a>) -> Option<[F; 3]> {
+    /// The emission at a point, per world unit.
+    fn emission_at(&self, p: [F; 3], visited: &mut Visited<'a>) -> Option<[F; 3]> {
         let (emission, frame) = self.scene.emission.as_ref().zip(self.emission)?;
         let rows = self.setup.to_emission.map(|row| row.map(F::from_f64));
         let at: [F; 3] =
@@ -237,7 +241,7 @@ impl<'a, F: Real> Tracer<'a, F> {
     }
 }
 
-/// Between eight values, ordered by x + 2y + 4z.
+/// Trilinear interpolation of eight values, ordered by x + 2y + 4z.
 fn interpolate<F: Real>(v: [F; 8], [x, y, z]: [F; 3]) -> F {
     let mix = |a: F, b: F, part: F| a * (F::from_i32(1) - part) + b * part;
     let over_z: [F; 4] = std::array::from_fn(|i| mix(v[i], v[i + 4], z));

@@ -20,12 +20,12 @@ use crate::volume::{BRICK_DIM, Coord, L1_DIM, L2_DIM};
 /// Steps after which a ray is given up: more than any box in view has cells across.
 const MAX_STEPS: u32 = 1 << 16;
 
-/// What there is in a picture: a frame of a grid, and one of the grid that glows in it if [`Scene::emission`] names one.
+/// What a picture shows: a frame, and the frame of the emissive grid that [`Scene::emission`] names.
 #[derive(Clone, Copy)]
 pub struct Medium<'a> {
-    /// The grid that is shown.
+    /// The frame.
     pub frame: &'a DecodedFrame,
-    /// The grid that glows.
+    /// The frame of the emissive grid.
     pub emission: Option<&'a DecodedFrame>,
 }
 
@@ -99,16 +99,16 @@ pub fn optical_depths<F: Real>(frame: &DecodedFrame, scene: &Scene) -> Result<Ve
     Ok((0..width * height).into_par_iter().map(depth).collect())
 }
 
-/// Pixels of the side of the picture from which an extinction is found: enough for a median.
+/// Side of the picture whose median optical depth is taken, in pixels.
 const MEDIAN_SIDE: u32 = 64;
-/// What is thinner than this part of the thickest fog is not counted as covered.
+/// Pixels below this fraction of the largest optical depth do not count as covered.
 const COVERED_PART: f32 = 0.01;
-/// Optical depth in the middle of what fog covers: half of it hides what is behind, and the other half is seen through.
+/// Median optical depth of the covered pixels: 5 % of the light behind passes through.
 const BODY_DEPTH: f64 = 3.0;
 
-/// An extinction at which fog is seen as a body with thin edges: half of the pixels that it covers have an optical depth of
-/// 3. That of the highest density alone leaves most smoke too thin, because of a few dense voxels. `None` where nothing is
-/// seen.
+/// An extinction at which fog looks like a body with thin edges: the median optical depth of the covered pixels is 3. An
+/// extinction from the highest density alone would leave most smoke too thin, because few voxels are that dense. `None` if
+/// nothing is covered.
 ///
 /// # Errors
 /// [`TraceError`].
@@ -136,7 +136,7 @@ struct Visited<'a> {
     steps: u32,
     varies: bool,
     nearby: Nearby<'a>,
-    /// The same in the grid that glows.
+    /// The same of the emissive grid.
     emission_nearby: Nearby<'a>,
 }
 
@@ -147,7 +147,7 @@ struct Tracer<'a, F> {
     scene: &'a Scene,
     setup: &'a Setup,
     extinction: F,
-    /// What the sun leaves of itself in the fog, of a picture that is lit.
+    /// Of lit fog.
     light: Option<&'a LightGrid<F>>,
     /// Which of the [`PERTURBATIONS`] moves rays and values: a bit for each axis, and one for the sign of
     /// [`perturbation_sign`].
@@ -196,13 +196,13 @@ impl<'a, F: Real> Tracer<'a, F> {
         let color = match self.scene.mode {
             Mode::Density if fog => {
                 let depth = if self.scene.is_trilinear() {
-                    self.marched_depth(&ray, self.first_sample(x, y), &mut visited)
+                    self.marched_depth(&ray, self.sample_offset(x, y), &mut visited)
                 } else {
                     self.optical_depth(&ray, &mut visited)
                 };
                 [opacity(depth, self.extinction).to_f64() as f32; 3]
             }
-            Mode::Lit if fog => self.lit_fog(&ray, self.first_sample(x, y), &mut visited),
+            Mode::Lit if fog => self.lit_fog(&ray, self.sample_offset(x, y), &mut visited),
             _ => {
                 let hit = self.first_hit(&ray, &mut visited);
                 self.shade(&ray, hit, &mut visited)

@@ -102,7 +102,7 @@ impl Params {
         })
     }
 
-    /// Points of the lattice on which light is measured.
+    /// Number of points of the light grid.
     pub fn light_points(&self) -> u32 {
         self.light_points.iter().product()
     }

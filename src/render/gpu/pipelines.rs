@@ -38,14 +38,14 @@ struct PipelineKey {
     hdda: bool,
     level_set: bool,
     trilinear: bool,
-    glows: bool,
+    emits: bool,
     has: Has,
 }
 
 /// What draws a picture.
 #[derive(Clone)]
 pub struct Drawing {
-    /// Fills the lattice of light, of lit fog.
+    /// Fills the light grid of lit fog.
     pub light: Option<wgpu::ComputePipeline>,
     /// Traces the rays.
     pub trace: wgpu::ComputePipeline,
@@ -55,7 +55,7 @@ pub struct Drawing {
 /// fastest on an NVIDIA H200, by 3 to 20 %.
 pub const WORKGROUP: [u32; 2] = [8, 16];
 
-/// Points of the light's lattice that a workgroup measures, as `measure_light` has them.
+/// Points of the light grid in a workgroup of `measure_light`.
 pub const LIGHT_WORKGROUP: u32 = 64;
 
 /// The pipelines of one device, and what they share.
@@ -103,7 +103,7 @@ impl Pipelines {
             hdda: scene.traversal == Traversal::Hdda,
             level_set: scene.level_set,
             trilinear: scene.is_trilinear(),
-            glows: scene.emission.is_some(),
+            emits: scene.emission.is_some(),
             has,
         };
         let mut made = self.made.lock().unwrap_or_else(PoisonError::into_inner);
@@ -127,7 +127,7 @@ impl Pipelines {
                         ("VP_CODECS", key.has.codecs.into()),
                         ("VP_MASKS", key.has.masks.into()),
                         ("VP_LIT", is_lit.into()),
-                        ("VP_GLOWS", key.glows.into()),
+                        ("VP_EMITS", key.emits.into()),
                         ("VP_SKIPS", key.hdda.into()),
                     ],
                     ..Default::default()

@@ -1,27 +1,26 @@
-// march.wgsl: fog between its voxels, in equal steps, and its light. It needs volpack.wgsl and hdda.wgsl.
-// src/render/cpu/march.rs is its twin.
+// march.wgsl: a ray march through lit fog. It needs volpack.wgsl and hdda.wgsl. src/render/cpu/march.rs is its twin.
 //
-// For lit fog the host supplies two functions of a place in cells:
+// For lit fog the host supplies two functions of a point in cells:
 //
-//   fn vp_depth_to_sun(p: vec3f) -> f32     the optical depth from there to the sun, for instance from a lattice
+//   fn vp_depth_to_sun(p: vec3f) -> f32     optical depth from there to the sun, for instance from a grid of points
 //                                           that vp_voxel_depth filled, or from a shadow map
-//   fn vp_glow(p: vec3f) -> vec3f           the light that is emitted there, per world unit; 0 for none
+//   fn vp_emission(p: vec3f) -> vec3f       emission there, per world unit
 //
 // and gets:
 //
-//   vp_march(fog, ray, first)               light and transmittance of a ray, from samples between voxels
-//   vp_voxel_depth(fog, ray)                density along a ray, exact, voxel by voxel
-//   vp_phase(g, cosine)                     how much fog scatters towards the eye
+//   vp_march(fog, ray, offset)              radiance and optical depth of a ray, sampled between voxels
+//   vp_voxel_depth(fog, ray)                integral of density along a ray, exact, voxel by voxel
+//   vp_phase(g, cosine)                     phase function
 //
-// Cells are voxels counted from `base`. For samples a cell lies between its voxel and the next ones; for
-// vp_voxel_depth it is the voxel, so that its rays begin half a cell farther on each axis.
+// Cells are voxels counted from `base`. For samples, cell i has voxels i and i + 1 as corners; for vp_voxel_depth,
+// cell i is the voxel around i, so its rays begin half a cell farther on each axis.
 //
-// Scattering is single. A step's own absorption is integrated exactly (Hillaire, "Physically based sky, atmosphere
-// and cloud rendering in Frostbite", 2016), so that light does not depend on the step's length.
+// Scattering is single. Absorption within a step is integrated analytically (Hillaire, "Physically based sky,
+// atmosphere and cloud rendering in Frostbite", 2016), so that brightness does not depend on the step.
 
-// What a host may promise when it makes a pipeline.
-override VP_LIT: bool = true;       // light is asked for, and not the optical depth alone
-override VP_GLOWS: bool = false;    // vp_glow may return light
+// What a host may promise when it creates a pipeline.
+override VP_LIT: bool = true;       // radiance is needed, not the optical depth alone
+override VP_EMITS: bool = false;    // vp_emission may return light
 override VP_SKIPS: bool = true;     // constant nodes are left in one step
 
 struct VpFog {
@@ -31,14 +30,14 @@ struct VpFog {
     frame: u32,
     high: vec3i,
     extinction: f32,        // optical depth of a density of 1 over a world unit
-    sun: vec3f,             // what a place scatters of the sun's light, where that is not dimmed
+    sun: vec3f,             // unoccluded sunlight times albedo and phase function
     step: f32,              // between two samples, in t of the ray
-    sky: vec3f,             // what it scatters of the sky's
+    sky: vec3f,             // sky light times albedo
 }
 
-// Optical depth at which a ray ends: what is behind is dimmed to a thousandth.
+// Optical depth at which a ray ends: the transmittance is then 0.001.
 const VP_OPAQUE = 7.0;
-// A step's optical depth under which what glows in it is taken as not dimmed.
+// Optical depth of a step below which its own absorption of emission is neglected.
 const VP_CLEAR = 1e-4;
 const VP_MAX_STEPS = 65536u;
 
@@ -65,7 +64,7 @@ fn vp_traced(fog: VpFog, walk: VpWalk) -> bool {
     return vp_inside(walk.cell, fog.low, fog.high) && vp_steps < VP_MAX_STEPS;
 }
 
-// The integral of density over distance, voxel by voxel. What is below 0 absorbs nothing.
+// The integral of density over distance, voxel by voxel. Densities below 0 count as 0.
 fn vp_voxel_depth(fog: VpFog, ray: VpRay) -> f32 {
     var depth = 0.0;
     var walk = vp_enter(ray, fog.low, fog.high);
@@ -101,17 +100,17 @@ fn vp_voxel_depth(fog: VpFog, ray: VpRay) -> f32 {
 }
 
 struct VpMarched {
-    light: vec3f,
-    depth: f32,         // optical depth up to where the ray ended
+    light: vec3f,       // radiance without what is behind
+    depth: f32,         // optical depth
 }
 
 // The number of the first sample that is not before t.
-fn vp_sample_from(t: f32, step: f32, first: f32) -> f32 {
-    return ceil(t / step - first);
+fn vp_sample_from(t: f32, step: f32, offset: f32) -> f32 {
+    return ceil(t / step - offset);
 }
 
-// Samples lie `first` of a step behind each multiple of the step.
-fn vp_march(fog: VpFog, ray: VpRay, first: f32) -> VpMarched {
+// Samples are at t = (number + offset) · step.
+fn vp_march(fog: VpFog, ray: VpRay, offset: f32) -> VpMarched {
     var light = vec3f(0.0);
     var depth = 0.0;
     var through = 1.0;
@@ -121,13 +120,13 @@ fn vp_march(fog: VpFog, ray: VpRay, first: f32) -> VpMarched {
     }
     let g = vp_grid(fog.grid);
     var l2 = VP_NOWHERE;
-    var next = vp_sample_from(walk.t, fog.step, first);
+    var next = vp_sample_from(walk.t, fog.step, offset);
     while vp_traced(fog, walk) && depth < VP_OPAQUE {
         vp_steps++;
         let at = vp_place(fog, g, l2, walk.cell);
         l2 = at.cell;
-        // A cell reaches over to the next voxels: the last layer of a node's cells is not of one value, unless all
-        // around is background too.
+        // A cell has the next voxels as corners, so the last layer of a node's cells is not constant, unless the nodes
+        // around it are background too.
         let skips = VP_SKIPS && at.node.constant;
         let alone = skips && at.node.dim == 8 && vp_alone(l2, walk.cell + fog.base);
         let inner = min(at.high, at.node.min - fog.base + at.node.dim - select(1, 0, alone));
@@ -136,13 +135,13 @@ fn vp_march(fog: VpFog, ray: VpRay, first: f32) -> VpMarched {
         let low = select(max(block, at.low), at.low, is_inner);
         let high = select(min(block + 8, at.high), inner, is_inner);
         walk = vp_leave(ray, walk, low, high);
-        if !VP_GLOWS && is_inner && at.node.value <= 0.0 {
-            next = vp_sample_from(walk.t, fog.step, first);
+        if !VP_EMITS && is_inner && at.node.value <= 0.0 {
+            next = vp_sample_from(walk.t, fog.step, offset);
             continue;
         }
         let brick = vp_brick(g, at.node);
         loop {
-            let t = (next + first) * fog.step;
+            let t = (next + offset) * fog.step;
             if t >= walk.t || vp_steps >= VP_MAX_STEPS {
                 break;
             }
@@ -151,7 +150,7 @@ fn vp_march(fog: VpFog, ray: VpRay, first: f32) -> VpMarched {
             let p = ray.origin + ray.direction * t;
             var value = at.node.value;
             if !is_inner {
-                // By a rounding a place may lie beside its region.
+                // Rounding may put p just outside the region.
                 let cell = clamp(vec3i(floor(p)), low, high - 1);
                 value = vp_between(vp_corners(g, fog.frame, l2, brick, cell + fog.base), p - vec3f(cell));
             }
@@ -162,9 +161,9 @@ fn vp_march(fog: VpFog, ray: VpRay, first: f32) -> VpMarched {
                 if thickness > 0.0 {
                     light += (through - left) * (fog.sun * exp(-vp_depth_to_sun(p)) + fog.sky);
                 }
-                if VP_GLOWS {
+                if VP_EMITS {
                     let seen = select((through - left) / thickness, through, thickness < VP_CLEAR);
-                    light += vp_glow(p) * (fog.step * seen);
+                    light += vp_emission(p) * (fog.step * seen);
                 }
                 through = left;
             }
@@ -176,8 +175,8 @@ fn vp_march(fog: VpFog, ray: VpRay, first: f32) -> VpMarched {
     return VpMarched(light, depth);
 }
 
-// The phase function of Henyey and Greenstein ("Diffuse radiation in the galaxy", 1941), as a multiple of what
-// scatters alike everywhere. The cosine is that of the angle between the ray and the way to the sun.
+// The phase function of Henyey and Greenstein ("Diffuse radiation in the galaxy", 1941), relative to isotropic
+// scattering. `cosine` is that of the angle between the ray and the direction to the sun.
 fn vp_phase(g: f32, cosine: f32) -> f32 {
     return (1.0 - g * g) / pow(1.0 + g * g - 2.0 * g * cosine, 1.5);
 }

@@ -20,24 +20,24 @@ struct Params {
     sun_world: vec3f,
     ambient: f32,
     normal_x: vec3f,        // rows whose products with a gradient are the normal in world space
-    step: f32,              // between two samples of fog, in world units or in cells
+    step: f32,              // of the ray march, in world units or in cells
     normal_y: vec3f,
     step_in_cells: u32,
     normal_z: vec3f,
-    jitter: u32,            // whether each pixel's samples begin elsewhere
+    jitter: u32,            // whether each pixel's samples are offset by a hash
     to_sun: vec3f,          // towards the sun of fog, in cells a world unit
     anisotropy: f32,
     sun_cosine: vec3f,      // its product with a direction in cells is the cosine of the angle with the sun
-    light_spacing: i32,     // cells between two points of the lattice on which light is measured
+    light_spacing: i32,     // cells between two points of the light grid
     light_points: vec3u,    // how many there are along each axis
     emission_grid: u32,
-    sun_light: vec3f,       // what fog scatters of the sun's light, where that is not dimmed
+    sun_light: vec3f,       // unoccluded sunlight times albedo
     emission_frame: u32,
-    sky_light: vec3f,       // what it scatters of the sky's
+    sky_light: vec3f,       // sky light times albedo
     emission_scale: f32,    // from values to places on the ramp
-    backdrop: vec3f,        // what is behind lit fog
-    to_emission: array<vec4f, 3>,       // rows whose products with a place in cells, and 1, are that in the other grid
-    ramp: array<vec4f, 64>,             // what glows per world unit
+    backdrop: vec3f,        // radiance behind lit fog
+    to_emission: array<vec4f, 3>,       // rows of the matrix from cells to the emissive grid's index space
+    ramp: array<vec4f, 64>,             // emission per world unit
 }
 
 // A pipeline does one thing: what it does not is left out of its code, and costs no registers.
@@ -88,7 +88,7 @@ fn traced(walk: VpWalk) -> bool {
     return vp_inside(walk.cell, params.low, params.high) && steps < MAX_STEPS;
 }
 
-// The fog that params describe, for a ray whose t is in world units.
+// The fog of the picture; the ray's t is in world units.
 fn fog_of(ray: VpRay) -> VpFog {
     let t_of_step = select(1.0, 1.0 / length(ray.direction), params.step_in_cells != 0u);
     let phase = vp_phase(params.anisotropy, dot(ray.direction, params.sun_cosine));
@@ -98,8 +98,8 @@ fn fog_of(ray: VpRay) -> VpFog {
     );
 }
 
-// Where a pixel's first sample may lie, in steps: in the middle of the step, or anywhere in it.
-fn first_sample(pixel: vec2u) -> f32 {
+// The offset of a pixel's samples, in steps: 0.5, or a hash of the pixel.
+fn sample_offset(pixel: vec2u) -> f32 {
     if params.jitter == 0u {
         return 0.5;
     }
@@ -123,7 +123,7 @@ fn vp_depth_to_sun(p: vec3f) -> f32 {
     return vp_between(VpCorners(near, far), place - vec3f(low));
 }
 
-fn vp_glow(p: vec3f) -> vec3f {
+fn vp_emission(p: vec3f) -> vec3f {
     let at = vec4f(p, 1.0);
     let m = params.to_emission;
     let place = vec3f(dot(m[0], at), dot(m[1], at), dot(m[2], at));
@@ -496,7 +496,7 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
     if LEVEL_SET || (MODE != DENSITY && MODE != LIT) {
         color = shade(ray, first_hit(ray));
     } else if TRILINEAR {
-        let marched = vp_march(fog_of(ray), ray, first_sample(id.xy));
+        let marched = vp_march(fog_of(ray), ray, sample_offset(id.xy));
         let through = exp(-marched.depth);
         color = select(vec3f(1.0 - through), marched.light + through * params.backdrop, VP_LIT);
     } else {
@@ -509,7 +509,7 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
     output[id.y * params.width + id.x] = vec4f(color, f32(steps));
 }
 
-// Fills the lattice of optical depths to the sun.
+// Fills the light grid: optical depths to the sun.
 @compute @workgroup_size(64)
 fn measure_light(@builtin(global_invocation_id) id: vec3u) {
     let points = params.light_points;
