@@ -39,7 +39,7 @@ pub struct Args {
 }
 
 /// Along (-0.6, -0.35, -0.72) from one diagonal away.
-const VIEW: View = View::Orbit([39.8056, 20.4927, 1.0]);
+pub const VIEW: View = View::Orbit([39.8056, 20.4927, 1.0]);
 
 /// What is shown of a level set or of fog: its name, which is the peer's word too, and how.
 type Shown = (&'static str, Mode, Interpolation);

@@ -1,0 +1,125 @@
+//! What was measured, as a table, as JSON and as a page.
+
+use std::fmt::Write;
+
+use serde::Serialize;
+
+use super::quality::{Apart, Seams};
+use crate::process_stats::median;
+
+/// Bytes of a layout on the GPU. Texels are those of bricks; places of a texture that no brick fills are not counted.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct Bytes {
+    pub texels: u64,
+    pub records: u64,
+    /// The tree without records and masks, or the indirection.
+    pub tree: u64,
+    pub masks: u64,
+}
+
+impl Bytes {
+    pub fn total(&self) -> u64 {
+        self.texels + self.records + self.tree + self.masks
+    }
+}
+
+/// Milliseconds of a frame: a median for each round, and what they come to.
+#[derive(Clone, Debug, Serialize)]
+pub struct Times {
+    pub rounds: Vec<f64>,
+    pub median: f64,
+    /// The largest median of a round less the smallest, as a fraction of the median.
+    pub spread: f64,
+}
+
+/// One layout with one coding of one volume.
+#[derive(Clone, Debug, Serialize)]
+pub struct Row {
+    pub volume: String,
+    pub layout: String,
+    pub lookup: String,
+    pub coding: String,
+    /// Bricks with texels.
+    pub bricks: usize,
+    pub bytes: Bytes,
+    pub seams: Seams,
+    pub psnr: f64,
+    /// The mean of the picture: density · voxels.
+    pub mean: f64,
+    /// How far the picture is from that of the f32 pack, and from one that the CPU makes of the same texels.
+    pub picture: Apart,
+    pub model: Option<Apart>,
+    pub times: Option<Times>,
+}
+
+impl Row {
+    /// A row without seams, to be drawn and timed.
+    pub fn new(
+        volume: &str,
+        layout: &str,
+        lookup: &str,
+        coding: &str,
+        bricks: usize,
+        bytes: Bytes,
+        psnr: f64,
+    ) -> Self {
+        Self {
+            volume: volume.to_owned(),
+            layout: layout.to_owned(),
+            lookup: lookup.to_owned(),
+            coding: coding.to_owned(),
+            bricks,
+            bytes,
+            seams: Seams::default(),
+            psnr,
+            mean: 0.0,
+            picture: Apart::default(),
+            model: None,
+            times: None,
+        }
+    }
+}
+
+/// The table of fog rows, as Markdown.
+pub fn fog_table(rows: &[Row]) -> String {
+    let mut table = String::from(
+        "| volume | layout | lookup | codec | ms | spread | MB | texels | records | tree | bricks | PSNR dB | seam mean | seam max | picture mean | picture max |\n",
+    );
+    table += &format!("{}|\n", "|---".repeat(16));
+    for row in rows {
+        let Row { volume, layout, lookup, coding, bytes, .. } = row;
+        let times = row.times.as_ref();
+        let mb = |bytes: u64| format!("{:.3}", bytes as f64 / 1e6);
+        // Writing to a string does not fail.
+        let _ = writeln!(
+            table,
+            "| {volume} | {layout} | {lookup} | {coding} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
+            times.map_or("".to_owned(), |t| format!("{:.4}", t.median)),
+            times.map_or("".to_owned(), |t| percent(t.spread)),
+            mb(bytes.total()),
+            mb(bytes.texels),
+            mb(bytes.records),
+            mb(bytes.tree + bytes.masks),
+            row.bricks,
+            if row.psnr.is_finite() { format!("{:.2}", row.psnr) } else { "exact".to_owned() },
+            percent(row.seams.mean),
+            percent(row.seams.max),
+            percent(row.picture.mean),
+            percent(row.picture.max),
+        );
+    }
+    table
+}
+
+pub fn percent(fraction: f64) -> String {
+    format!("{:.3} %", fraction * 100.0)
+}
+
+impl Times {
+    /// Of the medians of some rounds.
+    pub fn new(rounds: Vec<f64>) -> Self {
+        let middle = median(rounds.iter().copied());
+        let (least, most) = rounds.iter().fold((f64::INFINITY, 0.0f64), |(l, m), v| (l.min(*v), m.max(*v)));
+        Self { median: middle, spread: (most - least) / middle, rounds }
+    }
+}
