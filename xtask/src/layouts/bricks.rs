@@ -144,37 +144,60 @@ impl Coding {
     }
 }
 
-/// Which codec today's adaptive pack chose for each region of 8³ that has texels.
-pub struct Choices(HashMap<Coord, Codec>);
+/// What today's adaptive pack chose.
+pub struct Choices {
+    /// The codec of each region of 8³ that has texels.
+    codecs: HashMap<Coord, Codec>,
+    /// The largest deviation of the source's values from their mean (its square's mean) in a region that became one value.
+    flattest: f64,
+}
 
 impl Choices {
-    /// Those of a pack's first frame.
-    pub fn of(pack: &Pack) -> Self {
-        let mut choices = HashMap::new();
+    /// Those of a pack's first frame. `exact` are the source's values.
+    pub fn of(pack: &Pack, exact: &Voxels) -> Self {
+        let mut codecs = HashMap::new();
         pack.frame_tree(0, 0).for_each_region(|origin, _, region| {
             if let Region::Brick(record) = region
                 && record.codec != Codec::Constant
             {
-                choices.insert(origin, record.codec);
+                codecs.insert(origin, record.codec);
             }
         });
-        Self(choices)
+        let flattened = exact.bricks().filter(|(origin, _)| !codecs.contains_key(origin));
+        let flattest = flattened.map(|(_, values)| variance(&values[..])).fold(0.0, f64::max);
+        Self { codecs, flattest }
     }
 
-    /// The codec of the region that holds a brick's centre. If it has no texels, another region's that the brick samples; if none
-    /// has any, the brick is a constant. Bricks that do not fit blocks have bc4 for bc7.
-    fn choose(&self, shape: Shape, place: [i32; 3]) -> Codec {
+    /// Regions with texels.
+    pub fn with_texels(&self) -> usize {
+        self.codecs.len()
+    }
+
+    /// The codec of the region that holds a brick's centre. If that has no texels, the brick is a constant too, unless its values vary more than
+    /// any that today's pack flattened: then the codec is that of another region in which it lies. Bricks that do not fit blocks have
+    /// bc4 for bc7.
+    fn choose(&self, shape: Shape, place: [i32; 3], values: &[f32]) -> Codec {
         let origin = Coord(place.map(|b| b * shape.pitch));
-        let centre = origin.offset_by([shape.pitch / 2; 3]);
+        let at = |step: [i32; 3]| self.codecs.get(&origin.offset_by(step).align_down(BRICK_DIM)).copied();
         let steps = || (0..=shape.pitch).step_by(shape.pitch.min(BRICK_DIM) as usize).chain([shape.pitch]);
-        let others = steps().flat_map(|x| steps().flat_map(move |y| steps().map(move |z| [x, y, z])));
-        let places = [centre].into_iter().chain(others.map(|step| origin.offset_by(step)));
-        let chosen = places.filter_map(|at| self.0.get(&at.align_down(BRICK_DIM))).next();
-        match chosen {
+        let around = || {
+            let mut others = steps().flat_map(|x| steps().flat_map(move |y| steps().map(move |z| [x, y, z])));
+            if variance(values) <= self.flattest { None } else { others.find_map(at) }
+        };
+        match at([shape.pitch / 2; 3]).or_else(around) {
             Some(Codec::Bc7) if !shape.fits_blocks() => Codec::Bc4,
-            chosen => chosen.copied().unwrap_or(Codec::Constant),
+            chosen => chosen.unwrap_or(Codec::Constant),
         }
     }
+}
+
+fn mean(values: &[f32]) -> f64 {
+    values.iter().map(|v| f64::from(*v)).sum::<f64>() / values.len() as f64
+}
+
+fn variance(values: &[f32]) -> f64 {
+    let mean = mean(values);
+    values.iter().map(|v| (f64::from(*v) - mean).powi(2)).sum::<f64>() / values.len() as f64
 }
 
 /// An encoded brick.
@@ -207,11 +230,10 @@ pub fn encode(
         let codec = match coding {
             Coding::Uniform(codec) => codec.codec(),
             Coding::GridRange => Codec::Unorm8,
-            Coding::Adaptive => choices.choose(shape, *place),
+            Coding::Adaptive => choices.choose(shape, *place, values),
         };
         if codec == Codec::Constant {
-            let sum: f64 = values.iter().map(|v| f64::from(*v)).sum();
-            return Ok((*place, constant((sum / values.len() as f64) as f32)));
+            return Ok((*place, constant(mean(values) as f32)));
         }
         let (min, max) = values.iter().fold((f32::MAX, f32::MIN), |(l, h), v| (l.min(*v), h.max(*v)));
         let range = if coding == Coding::GridRange { BrickRange::SEQUENCE } else { sequence.fit(min, max) };

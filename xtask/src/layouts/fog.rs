@@ -8,13 +8,13 @@ use volpack::pack::Pack;
 use volpack::pack::tree::{MASK_WORDS, RECORD_WORDS, header};
 
 use super::atlas::{self, Lookup, Texture};
-use super::bricks::{self, Coding, Decoded, Encoded, SHAPES, Shape};
+use super::bricks::{self, Choices, Coding, Decoded, Encoded, SHAPES, Shape};
 use super::gpu::{Gpu, Params, Program, Textures};
 use super::quality::{self, Field};
 use super::report::{Bytes, Row};
 use super::source::Source;
 use super::voxels::{Voxels, interpolate};
-use super::{Entry, STEP};
+use super::{Entry, Maker, STEP};
 
 static FETCH: [&str; 1] = [include_str!("fetch.wgsl")];
 static FILTERED: [&str; 2] = [include_str!("filtered.wgsl"), include_str!("fog.wgsl")];
@@ -25,18 +25,30 @@ const DENSE_SHAPE: Shape = Shape { texels: 9, pitch: 8, border: 0 };
 
 /// Builds the rows of one volume.
 pub struct Fog<'a> {
-    pub gpu: &'a mut Gpu,
-    pub source: &'a Source,
-    pub output: &'a wgpu::Buffer,
-    pub size: [u32; 2],
+    gpu: &'a mut Gpu,
+    source: &'a Source,
+    output: wgpu::Buffer,
+    size: [u32; 2],
     /// Whether pictures of decoded texels are computed on the CPU too.
-    pub check: bool,
-    pub entries: Vec<Entry>,
+    check: bool,
+    entries: Vec<Entry>,
 }
 
-impl Fog<'_> {
+impl<'a> Fog<'a> {
     /// All rows; the first is the reference.
-    pub fn rows(&mut self) -> Result<(), Box<dyn Error>> {
+    pub fn rows(
+        gpu: &'a mut Gpu,
+        source: &'a Source,
+        size: [u32; 2],
+        check: bool,
+    ) -> Result<Vec<Entry>, Box<dyn Error>> {
+        let output = gpu.output(size, 1);
+        let mut fog = Self { gpu, source, output, size, check, entries: Vec::new() };
+        fog.add_all()?;
+        Ok(fog.entries)
+    }
+
+    fn add_all(&mut self) -> Result<(), Box<dyn Error>> {
         for coding in [Coding::Uniform(TexelCodec::F32)].into_iter().chain(Coding::ALL) {
             self.fetched(coding)?;
         }
@@ -87,16 +99,16 @@ impl Fog<'_> {
         mut row: Row,
         field: Field,
     ) -> Result<(), Box<dyn Error>> {
-        let kernel = self.gpu.kernel(&program, words, textures, params, self.output);
+        let kernel = self.gpu.kernel(&program, words, textures, params, &self.output);
         let picture = self.gpu.picture(&kernel)?;
         let reference = self.entries.first().map_or(&picture, |first| &first.picture);
         row.picture = quality::apart(&picture, reference);
-        row.mean = picture.iter().map(|v| f64::from(*v)).sum::<f64>() / picture.len() as f64;
+        row.mean = quality::mean(&picture);
         if self.check {
             let model = quality::march(field, &self.source.view, self.size, STEP);
             row.model = Some(quality::apart(&picture, &model));
         }
-        self.entries.push(Entry { row, kernel, picture });
+        self.entries.push(Entry { row, maker: Maker::Shader(kernel), picture });
         Ok(())
     }
 
@@ -113,7 +125,7 @@ impl Fog<'_> {
         let tree = pack.tree();
         let records = tree[header::RECORDS] as usize * RECORD_WORDS;
         let masks = tree[header::MASKS] as usize * MASK_WORDS;
-        let bricks = pack.atlases().iter().map(|atlas| atlas.bricks as usize).sum();
+        let bricks = Choices::of(&pack, &voxels).with_texels();
         let texels =
             pack.atlases().iter().map(|a| a.bricks as usize * a.codec.layout().brick_bytes()).sum::<usize>();
         let bytes = Bytes {

@@ -4,8 +4,10 @@
 mod atlas;
 mod blocks;
 mod bricks;
+mod chart;
 mod fog;
 mod gpu;
+mod nanovdb;
 mod quality;
 mod report;
 mod source;
@@ -20,7 +22,9 @@ use volpack::sweep::steady;
 
 use self::fog::Fog;
 use self::gpu::{Gpu, Kernel};
-use self::report::{Row, Times};
+use self::nanovdb::{March, Peer};
+use self::quality::{apart, mean};
+use self::report::{Bytes, Row, Run, Times};
 use self::source::Source;
 use crate::peer_programs;
 use crate::process_stats::median;
@@ -48,16 +52,39 @@ pub struct Args {
     /// Report times of a software device, which mean nothing
     #[arg(long)]
     allow_software: bool,
+    /// Folder that contains nanovdb/, to compare with that version; repeat it for another [default: the compiler's path]
+    #[arg(long, value_name = "DIR")]
+    nanovdb: Vec<PathBuf>,
     /// Also write the raw figures to this JSON file
     #[arg(long)]
     json: Option<PathBuf>,
+    /// Also write the tables to this Markdown page
+    #[arg(long)]
+    page: Option<PathBuf>,
+    /// Also draw milliseconds against bytes into this SVG file
+    #[arg(long)]
+    chart: Option<PathBuf>,
 }
 
 /// A row, and what makes its picture.
 struct Entry {
     row: Row,
-    kernel: Kernel,
+    maker: Maker,
     picture: Vec<f32>,
+}
+
+enum Maker {
+    Shader(Kernel),
+    NanoVdb(March),
+}
+
+impl Maker {
+    fn time(&mut self, gpu: &Gpu, frames: u32) -> Result<Vec<f64>, Box<dyn Error>> {
+        match self {
+            Self::Shader(kernel) => gpu.time(kernel, frames),
+            Self::NanoVdb(march) => march.time(frames),
+        }
+    }
 }
 
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
@@ -77,21 +104,21 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
         _ if args.check => [96, 54],
         _ => [1920, 1080],
     };
-    let output = gpu.output(size, 1);
+    let run = Run::new(&gpu.info, size, args.repeats, args.rounds)?;
+    println!("{}\n", run.head());
+    let peers = peers(args);
+    if let Err(reason) = &peers {
+        println!("NanoVDB is not measured: {reason}\n");
+    }
+    let peers = peers.unwrap_or_default();
     let mut rows = Vec::new();
     let mut wrong = 0;
     for path in &args.files {
         let source = Source::open(path, size)?;
-        let mut fog = Fog {
-            gpu: &mut gpu,
-            source: &source,
-            output: &output,
-            size,
-            check: args.check,
-            entries: Vec::new(),
-        };
-        fog.rows()?;
-        let mut entries = fog.entries;
+        let mut entries = Fog::rows(&mut gpu, &source, size, args.check)?;
+        for peer in &peers {
+            nanovdb_rows(peer, &source, size, &mut entries)?;
+        }
         if args.check {
             wrong += check(&entries);
         } else {
@@ -101,22 +128,66 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
         println!("{}", report::fog_table(&volume));
         rows.extend(volume);
     }
-    peer_programs::write(args.json.as_deref(), &json!({ "device": gpu.info.name, "fog": rows }))?;
+    if let Some(page) = &args.page {
+        std::fs::write(page, report::page(&run, &rows))?;
+    }
+    if let Some(svg) = &args.chart {
+        chart::draw(svg, &rows)?;
+    }
+    peer_programs::write(args.json.as_deref(), &json!({ "run": run, "fog": rows }))?;
     if wrong > 0 {
         return Err(format!("{wrong} pictures differ from what their texels decode to").into());
     }
     Ok(())
 }
 
+fn peers(args: &Args) -> Result<Vec<Peer>, Box<dyn Error>> {
+    if args.nanovdb.is_empty() {
+        return Ok(vec![Peer::compile(None)?]);
+    }
+    args.nanovdb.iter().map(|headers| Peer::compile(Some(headers))).collect()
+}
+
+/// Adds NanoVDB's rows; a message says why there are none.
+fn nanovdb_rows(
+    peer: &Peer,
+    source: &Source,
+    size: [u32; 2],
+    entries: &mut Vec<Entry>,
+) -> Result<(), Box<dyn Error>> {
+    let nvdb = match peer.nvdb(source) {
+        Ok(nvdb) => nvdb,
+        Err(reason) => {
+            println!("NanoVDB is not measured on {}: {reason}\n", source.name);
+            return Ok(());
+        }
+    };
+    let bytes = Bytes { texels: nvdb.metadata()?.len(), records: 0, tree: 0, masks: 0 };
+    for (mode, lookup) in [("all", "every sample"), ("skip", "constant nodes left")] {
+        let mut once = peer.start(&nvdb, mode, source, size)?;
+        once.time(1)?;
+        let picture = once.finish()?;
+        let layout = format!("NanoVDB {}", peer.version);
+        let mut row = Row::new(&source.name, &layout, lookup, "f32", 0, bytes, f64::INFINITY);
+        row.picture = apart(&picture, &entries[0].picture);
+        row.mean = mean(&picture);
+        // The reference is itself compared with the CPU's.
+        row.model = Some(row.picture);
+        let maker = Maker::NanoVdb(peer.start(&nvdb, mode, source, size)?);
+        entries.push(Entry { row, maker, picture });
+    }
+    Ok(())
+}
+
 /// Times all rows of a volume round by round, so that a drift of the clocks hits them alike.
 fn time(gpu: &Gpu, args: &Args, entries: &mut [Entry]) -> Result<(), Box<dyn Error>> {
-    if let Some(first) = entries.first() {
-        steady(args.repeats, |frames| gpu.time(&first.kernel, frames))?;
+    if let Some(first) = entries.first_mut() {
+        steady(args.repeats, |frames| first.maker.time(gpu, frames))?;
     }
     let mut rounds = vec![Vec::new(); entries.len()];
     for _ in 0..args.rounds {
-        for (entry, rounds) in entries.iter().zip(&mut rounds) {
-            rounds.push(median(gpu.time(&entry.kernel, args.repeats)?));
+        for (entry, rounds) in entries.iter_mut().zip(&mut rounds) {
+            rounds.push(median(entry.maker.time(gpu, args.repeats)?));
         }
     }
     for (entry, rounds) in entries.iter_mut().zip(rounds) {

@@ -74,19 +74,22 @@ pub fn march(field: Field, view: &View, size: [u32; 2], step: f64) -> Vec<f32> {
     pixels.par_iter().map(sum).collect()
 }
 
-/// How far pictures are apart, as fractions of the largest value of the second.
+/// How far pictures are apart, as fractions of the largest value of the second. The mean is over pixels that are not 0 in it.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct Apart {
     pub mean: f64,
     pub max: f64,
 }
 
+/// The mean of a picture.
+pub fn mean(picture: &[f32]) -> f64 {
+    picture.iter().map(|v| f64::from(*v)).sum::<f64>() / picture.len() as f64
+}
+
 /// Compares a picture with another.
 pub fn apart(ours: &[f32], reference: &[f32]) -> Apart {
-    let peak = reference.iter().copied().fold(f32::MIN_POSITIVE, f32::max);
-    let differences = || ours.iter().zip(reference).map(|(a, b)| f64::from((a - b).abs() / peak));
-    Apart {
-        mean: differences().sum::<f64>() / reference.len() as f64,
-        max: differences().fold(0.0, f64::max),
-    }
+    let peak = f64::from(reference.iter().copied().fold(f32::MIN_POSITIVE, f32::max));
+    let differences = || ours.iter().zip(reference).map(|(a, b)| f64::from((a - b).abs()) / peak);
+    let covered = reference.iter().filter(|v| **v != 0.0).count();
+    Apart { mean: differences().sum::<f64>() / covered.max(1) as f64, max: differences().fold(0.0, f64::max) }
 }

@@ -1,9 +1,12 @@
 //! What was measured, as a table, as JSON and as a page.
 
+use std::error::Error;
 use std::fmt::Write;
+use std::process::Command;
 
 use serde::Serialize;
 
+use super::STEP;
 use super::quality::{Apart, Seams};
 use crate::process_stats::median;
 
@@ -123,3 +126,58 @@ impl Times {
         Self { median: middle, spread: (most - least) / middle, rounds }
     }
 }
+
+/// When, where and how a benchmark ran.
+#[derive(Clone, Debug, Serialize)]
+pub struct Run {
+    date: String,
+    device: String,
+    driver: String,
+    backend: String,
+    size: [u32; 2],
+    step: f64,
+    repeats: u32,
+    rounds: u32,
+}
+
+impl Run {
+    pub fn new(
+        info: &wgpu::AdapterInfo,
+        size: [u32; 2],
+        repeats: u32,
+        rounds: u32,
+    ) -> Result<Self, Box<dyn Error>> {
+        let date = Command::new("date").args(["-u", "+%Y-%m-%d"]).output()?.stdout;
+        Ok(Self {
+            date: String::from_utf8(date)?.trim().to_owned(),
+            device: info.name.clone(),
+            driver: format!("{} {}", info.driver, info.driver_info),
+            backend: format!("{:?}", info.backend),
+            size,
+            step: STEP,
+            repeats,
+            rounds,
+        })
+    }
+
+    /// One line on all of it.
+    pub fn head(&self) -> String {
+        let Self { date, device, driver, backend, size: [width, height], step, repeats, rounds } = self;
+        format!(
+            "{date}, {device} ({backend}, {driver}), {width} × {height}, a sample each {step} voxels, medians of {rounds} rounds of {repeats} frames"
+        )
+    }
+}
+
+/// The Markdown page of a run.
+pub fn page(run: &Run, rows: &[Row]) -> String {
+    format!("# Brick layouts\n\n{}.\n\n{FOG_NOTES}\n\n{}", run.head(), fog_table(rows))
+}
+
+const FOG_NOTES: &str = "\
+All rows sum the same samples of density along the same rays. MB are 10⁶ bytes: texels of bricks (places of a texture that no brick fills are \
+not counted), records, and the tree with masks or the indirection. PSNR is that of the filtered value at 200,000 random points of the box of \
+active voxels. A seam is the jump of the filtered value across a face between two bricks with texels, as a fraction of the grid's range. \
+The picture's difference is from that of the f32 pack, as a fraction of its largest value; the mean is over pixels that show fog. Spread is the range \
+of the rounds' medians. Adaptive bricks have the codec that a default adaptive pack chose for the region that holds the brick's centre; \
+9³ and 10³ have bc4 where it chose bc7. NanoVDB's row has the size of its file.";

@@ -55,7 +55,7 @@ impl Source {
             active: CoordBox::from_array(grid.frames[0].record.bbox),
             view: View::new(grid, voxels.bounds, size)?,
             sequence: SequenceRange::around(min, max).ok_or("the range of values is wider than an f32")?,
-            choices: Choices::of(&pack_of(path, Coding::Adaptive, folder.path())?),
+            choices: Choices::of(&pack_of(path, Coding::Adaptive, folder.path())?, &voxels),
             voxels,
             folder,
         })

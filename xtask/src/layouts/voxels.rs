@@ -68,6 +68,14 @@ impl Voxels {
         all.fold((f32::INFINITY, f32::NEG_INFINITY), |(min, max), v| (min.min(v), max.max(v)))
     }
 
+    /// The regions that have a value for each voxel, x slowest.
+    pub fn bricks(&self) -> impl Iterator<Item = (Coord, &[f32; BRICK_VOXELS])> {
+        self.regions.iter().filter_map(|(origin, content)| match content {
+            Content::Constant(_) => None,
+            Content::Voxels(values) => Some((*origin, &**values)),
+        })
+    }
+
     /// The value of a voxel.
     pub fn get(&self, at: Coord) -> f32 {
         match self.regions.get(&at.align_down(BRICK_DIM)) {
