@@ -85,8 +85,9 @@ fn region_at(p: vec3f, cell: ptr<function, Cell>) -> Region {
 struct Brick {
     codec: u32,
     axis: u32,
-    low: vec3f,             // bc7: its smallest corner
-    shift: vec3f,           // from a position to its place in the texture; bc7: the brick's first texel, in texels
+    low: vec3f,             // its smallest corner
+    first: vec3f,           // its first texel
+    shift: vec3f,           // but for bc7: from a position to its place in the texture
     inverse: vec3f,
     offset: f32,            // a value is offset + scale · texel
     scale: f32,
@@ -98,11 +99,9 @@ fn brick_of(region: Region) -> Brick {
     let slot = region.record.x >> 5u;
     let row = slot / atlas.columns;
     let layer = row / atlas.columns;
-    let first = vec3f(vec3u(slot - row * atlas.columns, row - layer * atlas.columns, layer)) * atlas.brick + 0.5;
-    var brick = Brick(codec, (region.record.x >> 3u) & 3u, region.low, first, atlas.inverse, 0.0, 1.0);
-    if !((VP_CODECS & 2u) != 0u && codec == BC7) {
-        brick.shift = (first + BORDER - region.low) * atlas.inverse;
-    }
+    let first = vec3f(vec3u(slot - row * atlas.columns, row - layer * atlas.columns, layer)) * atlas.brick;
+    let shift = (first + 0.5 + BORDER - region.low) * atlas.inverse;
+    var brick = Brick(codec, (region.record.x >> 3u) & 3u, region.low, first, shift, atlas.inverse, 0.0, 1.0);
     if ((VP_NORMALISED >> codec) & 1u) != 0u {
         brick.offset = params.lo + params.span * (f32(region.record.y & 0xffffu) / 65535.0);
         brick.scale = params.span * unpack2x16float(region.record.y).y;
@@ -128,7 +127,7 @@ fn filtered_bc7(brick: Brick, p: vec3f) -> f32 {
     let low = min(floor(along), PITCH - 1.0);
     let c = u32(low) & 3u;
     let across = vec3f(select(p.x, p.y, brick.axis == 0u), select(p.z, p.y, brick.axis == 2u), floor(low * 0.25));
-    let at = (across + brick.shift) * brick.inverse;
+    let at = (across + brick.first + 0.5) * brick.inverse;
     let texel = textureSampleLevel(bc7_texels, trilinear, at, 0.0);
     var pair = select(select(texel.xy, texel.yz, c == 1u), texel.zw, c == 2u);
     if c == 3u {

@@ -2,23 +2,23 @@
 
 use std::error::Error;
 
-use bytemuck::Zeroable;
 use volpack::codec::{Codec, TexelCodec};
 use volpack::pack::Pack;
-use volpack::pack::tree::{MASK_WORDS, RECORD_WORDS, header};
 
-use super::atlas::{self, Lookup, Texture};
+use super::atlas::{self, Texture};
 use super::bricks::{self, Choices, Coding, Decoded, Encoded, SHAPES, Shape};
-use super::gpu::{Gpu, Params, Program, Textures};
+use super::gpu::{Gpu, Program, Textures};
+use super::params::Params;
 use super::quality::{self, Field};
 use super::report::{Bytes, Row};
 use super::source::Source;
 use super::voxels::{Voxels, interpolate};
 use super::{Entry, Maker, STEP};
 
-static FETCH: [&str; 1] = [include_str!("fetch.wgsl")];
-static FILTERED: [&str; 2] = [include_str!("filtered.wgsl"), include_str!("fog.wgsl")];
-static DENSE: [&str; 1] = [include_str!("dense.wgsl")];
+static FETCH: [&str; 2] = [include_str!("density.wgsl"), include_str!("fetch.wgsl")];
+static FILTERED: [&str; 3] =
+    [include_str!("density.wgsl"), include_str!("filtered.wgsl"), include_str!("fog.wgsl")];
+static DENSE: [&str; 2] = [include_str!("density.wgsl"), include_str!("dense.wgsl")];
 
 /// Regions of the dense texture's indirection, as packs have them.
 const DENSE_SHAPE: Shape = Shape { texels: 9, pitch: 8, border: 0 };
@@ -66,29 +66,6 @@ impl<'a> Fog<'a> {
         self.dense()
     }
 
-    /// What all layouts ask of the shader. `base` is the voxel at position 0.
-    fn params(&self, base: [i32; 3], textures: &Textures) -> Params {
-        let Source { view, voxels, sequence, .. } = self.source;
-        let from_base = |p: [f64; 3]| std::array::from_fn(|a| (p[a] - f64::from(base[a])) as f32);
-        Params {
-            origin: from_base(view.origin),
-            width: self.size[0],
-            forward: view.forward.map(|c| c as f32),
-            height: self.size[1],
-            right: view.right.map(|c| c as f32),
-            step: STEP as f32,
-            up: view.up.map(|c| c as f32),
-            background: voxels.background,
-            low: from_base(view.low),
-            lo: sequence.lo,
-            high: from_base(view.high),
-            span: sequence.span,
-            base,
-            atlases: textures.atlases,
-            ..Params::zeroed()
-        }
-    }
-
     /// Adds a row. `field` is what its texels decode to.
     fn add(
         &mut self,
@@ -123,22 +100,12 @@ impl<'a> Fog<'a> {
         let textures = textures.collect::<Result<Vec<_>, _>>()?;
         let codecs = textures.iter().map(|texture| texture.codec);
         let tree = pack.tree();
-        let records = tree[header::RECORDS] as usize * RECORD_WORDS;
-        let masks = tree[header::MASKS] as usize * MASK_WORDS;
         let bricks = Choices::of(&pack, &voxels).with_texels();
-        let texels =
-            pack.atlases().iter().map(|a| a.bricks as usize * a.codec.layout().brick_bytes()).sum::<usize>();
-        let bytes = Bytes {
-            texels: texels as u64,
-            records: records as u64 * 4,
-            tree: (tree.len() - records - masks) as u64 * 4,
-            masks: masks as u64 * 4,
-        };
-        let constants = vec![("VP_CODECS", codec_bits(codecs)), ("VP_MASKS", f64::from(u8::from(masks > 0)))];
+        let bytes = Bytes::of(&pack);
+        let constants =
+            vec![("VP_CODECS", codec_bits(codecs)), ("VP_MASKS", f64::from(u8::from(bytes.masks > 0)))];
         let textures = self.gpu.upload(&textures)?;
-        let mut params = self.params(source.voxels.bounds.min.0, &textures);
-        // Ranges are in the tree.
-        (params.lo, params.span) = (0.0, 1.0);
+        let params = Params::new(source, self.size, source.voxels.bounds.min.0, &textures);
         for (keep, layout) in [(false, "fetch, as today"), (true, "fetch, brick kept")] {
             let constants = [&constants[..], &[("KEEP", f64::from(u8::from(keep)))]].concat();
             let row = Row::new(&source.name, layout, "tree", coding.name(), bricks, bytes, psnr);
@@ -180,21 +147,11 @@ impl<'a> Fog<'a> {
                 ("PITCH", f64::from(shape.pitch)),
                 ("BORDER", f64::from(shape.border)),
             ];
-            let params = self.with_lookup(&lookup, shape.pitch, &textures);
+            let params = Params::with_lookup(source, self.size, shape.pitch, &lookup, &textures);
             let program = Program { files: &FILTERED, constants };
             self.add(program, &lookup.words, &textures, params, row, &field)?;
         }
         Ok(())
-    }
-
-    fn with_lookup(&self, lookup: &Lookup, pitch: i32, textures: &Textures) -> Params {
-        Params {
-            nodes_at: lookup.nodes_at,
-            records_at: lookup.records_at,
-            constants_at: lookup.constants_at,
-            cells: lookup.cells.map(|n| n as i32),
-            ..self.params(lookup.origin.map(|place| place * pitch), textures)
-        }
     }
 
     /// One texture of the whole box.
@@ -233,7 +190,7 @@ impl<'a> Fog<'a> {
             brick: size.map(|n| n as u32),
         };
         let textures = self.gpu.upload(&[texture])?;
-        let params = self.with_lookup(&lookup, pitch, &textures);
+        let params = Params::with_lookup(source, self.size, pitch, &lookup, &textures);
         for (skip, name) in [(false, "none"), (true, "indirection")] {
             let tree = if skip { lookup.tree_bytes() } else { 0 };
             let bytes = Bytes { texels: bytes.len() as u64, records: 0, tree, masks: 0 };
@@ -247,7 +204,7 @@ impl<'a> Fog<'a> {
 }
 
 /// Bit `tag` for each codec, and bit 0 for constants: `VP_CODECS` of volpack.wgsl.
-fn codec_bits(codecs: impl Iterator<Item = Codec>) -> f64 {
+pub fn codec_bits(codecs: impl Iterator<Item = Codec>) -> f64 {
     f64::from(codecs.fold(1u32, |bits, codec| bits | 1 << codec as u32))
 }
 

@@ -3,52 +3,18 @@
 use std::collections::HashMap;
 use std::error::Error;
 
-use bytemuck::{Pod, Zeroable};
+use bytemuck::{Pod, Zeroable as _};
 use volpack::codec::{Codec, TextureFormat};
 use volpack::render::gpu::VOLPACK_WGSL;
 use wgpu::util::DeviceExt;
 
 use super::atlas::Texture;
+use super::params::{Atlas, Params};
 
 /// Pixels of a workgroup, as `main` in march.wgsl has them.
 const WORKGROUP: [u32; 2] = [8, 16];
 /// Frames of one submission: a query set has at most 4096 timestamps.
 const FRAMES_AT_ONCE: u32 = 1000;
-
-/// One texture of `Params` in march.wgsl.
-#[derive(Clone, Copy, Pod, Zeroable)]
-#[repr(C)]
-pub struct Atlas {
-    pub brick: [f32; 3],
-    pub columns: u32,
-    pub inverse: [f32; 3],
-    pub padding: u32,
-}
-
-/// `struct Params` of march.wgsl.
-#[derive(Clone, Copy, Pod, Zeroable)]
-#[repr(C)]
-pub struct Params {
-    pub origin: [f32; 3],
-    pub width: u32,
-    pub forward: [f32; 3],
-    pub height: u32,
-    pub right: [f32; 3],
-    pub step: f32,
-    pub up: [f32; 3],
-    pub background: f32,
-    pub low: [f32; 3],
-    pub lo: f32,
-    pub high: [f32; 3],
-    pub span: f32,
-    pub base: [i32; 3],
-    pub nodes_at: u32,
-    pub cells: [i32; 3],
-    pub records_at: u32,
-    pub constants_at: u32,
-    pub padding: [u32; 3],
-    pub atlases: [Atlas; Codec::WITH_TEXELS.len()],
-}
 
 /// A shader with its switches.
 #[derive(Clone, Debug)]

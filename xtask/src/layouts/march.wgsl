@@ -1,7 +1,5 @@
 // march.wgsl: bindings, camera and the steps of a ray, for all layouts of `xtask bench layouts`. It goes behind volpack.wgsl and
-// before the file of one layout, which gives
-//
-//   fn march(ray: Ray) -> f32           the sum of the samples 0 to ray.samples of a ray
+// before the files of one layout.
 //
 // Positions are voxels from `base`: voxel `base` is at 0. All layouts sample the same places of a ray, origin + direction ·
 // (start + k · step), so that their sums differ by what a layout does to values and by nothing else.
@@ -87,11 +85,4 @@ fn ray_of(x: u32, y: u32) -> Ray {
     let end = min(exit.x, min(exit.y, exit.z));
     let samples = max(0, i32(ceil((end - start) / params.step)));
     return Ray(params.origin + d * start, d * params.step, 1.0 / (d * params.step), samples, start);
-}
-
-@compute @workgroup_size(8, 16)
-fn main(@builtin(global_invocation_id) id: vec3u) {
-    if id.x < params.width && id.y < params.height {
-        output[id.y * params.width + id.x] = march(ray_of(id.x, id.y)) * params.step;
-    }
 }

@@ -8,9 +8,11 @@ mod chart;
 mod fog;
 mod gpu;
 mod nanovdb;
+mod params;
 mod quality;
 mod report;
 mod source;
+mod surface;
 mod view;
 mod voxels;
 
@@ -26,6 +28,7 @@ use self::nanovdb::{March, Peer};
 use self::quality::{apart, mean};
 use self::report::{Bytes, Row, Run, Times};
 use self::source::Source;
+use self::surface::Traced;
 use crate::peer_programs;
 use crate::process_stats::median;
 
@@ -75,6 +78,7 @@ struct Entry {
 
 enum Maker {
     Shader(Kernel),
+    Tracer(Traced),
     NanoVdb(March),
 }
 
@@ -82,6 +86,7 @@ impl Maker {
     fn time(&mut self, gpu: &Gpu, frames: u32) -> Result<Vec<f64>, Box<dyn Error>> {
         match self {
             Self::Shader(kernel) => gpu.time(kernel, frames),
+            Self::Tracer(traced) => traced.time(frames),
             Self::NanoVdb(march) => march.time(frames),
         }
     }
@@ -111,10 +116,21 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
         println!("NanoVDB is not measured: {reason}\n");
     }
     let peers = peers.unwrap_or_default();
-    let mut rows = Vec::new();
-    let mut wrong = 0;
+    let (mut fog, mut surfaces, mut wrong) = (Vec::new(), Vec::new(), 0);
     for path in &args.files {
         let source = Source::open(path, size)?;
+        if source.level_set {
+            let (mut rows, mut makers) = surface::rows(&mut gpu, &source, size)?;
+            if args.check {
+                wrong += surface::check(&rows);
+            } else {
+                let times = time(&gpu, args, makers.iter_mut())?;
+                rows.iter_mut().zip(times).for_each(|(row, times)| row.times = Some(times));
+            }
+            println!("{}", surface::table(&rows));
+            surfaces.extend(rows);
+            continue;
+        }
         let mut entries = Fog::rows(&mut gpu, &source, size, args.check)?;
         for peer in &peers {
             nanovdb_rows(peer, &source, size, &mut entries)?;
@@ -122,19 +138,20 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
         if args.check {
             wrong += check(&entries);
         } else {
-            time(&gpu, args, &mut entries)?;
+            let times = time(&gpu, args, entries.iter_mut().map(|entry| &mut entry.maker))?;
+            entries.iter_mut().zip(times).for_each(|(entry, times)| entry.row.times = Some(times));
         }
-        let volume: Vec<Row> = entries.into_iter().map(|entry| entry.row).collect();
-        println!("{}", report::fog_table(&volume));
-        rows.extend(volume);
+        let rows: Vec<Row> = entries.into_iter().map(|entry| entry.row).collect();
+        println!("{}", report::fog_table(&rows));
+        fog.extend(rows);
     }
     if let Some(page) = &args.page {
-        std::fs::write(page, report::page(&run, &rows))?;
+        std::fs::write(page, report::page(&run, &fog, &surfaces))?;
     }
     if let Some(svg) = &args.chart {
-        chart::draw(svg, &rows)?;
+        chart::draw(svg, &fog)?;
     }
-    peer_programs::write(args.json.as_deref(), &json!({ "run": run, "fog": rows }))?;
+    peer_programs::write(args.json.as_deref(), &json!({ "run": run, "fog": fog, "level_sets": surfaces }))?;
     if wrong > 0 {
         return Err(format!("{wrong} pictures differ from what their texels decode to").into());
     }
@@ -180,20 +197,22 @@ fn nanovdb_rows(
 }
 
 /// Times all rows of a volume round by round, so that a drift of the clocks hits them alike.
-fn time(gpu: &Gpu, args: &Args, entries: &mut [Entry]) -> Result<(), Box<dyn Error>> {
-    if let Some(first) = entries.first_mut() {
-        steady(args.repeats, |frames| first.maker.time(gpu, frames))?;
+fn time<'a>(
+    gpu: &Gpu,
+    args: &Args,
+    makers: impl Iterator<Item = &'a mut Maker>,
+) -> Result<Vec<Times>, Box<dyn Error>> {
+    let mut makers: Vec<&mut Maker> = makers.collect();
+    if let Some(first) = makers.first_mut() {
+        steady(args.repeats, |frames| first.time(gpu, frames))?;
     }
-    let mut rounds = vec![Vec::new(); entries.len()];
+    let mut rounds = vec![Vec::new(); makers.len()];
     for _ in 0..args.rounds {
-        for (entry, rounds) in entries.iter_mut().zip(&mut rounds) {
-            rounds.push(median(entry.maker.time(gpu, args.repeats)?));
+        for (maker, rounds) in makers.iter_mut().zip(&mut rounds) {
+            rounds.push(median(maker.time(gpu, args.repeats)?));
         }
     }
-    for (entry, rounds) in entries.iter_mut().zip(rounds) {
-        entry.row.times = Some(Times::new(rounds));
-    }
-    Ok(())
+    Ok(rounds.into_iter().map(Times::new).collect())
 }
 
 /// What 8-bit filter weights, and interpolation of BC4 by the device, may change of a picture: as fractions of its largest value.

@@ -5,9 +5,12 @@ use std::fmt::Write;
 use std::process::Command;
 
 use serde::Serialize;
+use volpack::pack::Pack;
+use volpack::pack::tree::{MASK_WORDS, RECORD_WORDS, header};
 
 use super::STEP;
 use super::quality::{Apart, Seams};
+use super::surface::{self, SurfaceRow};
 use crate::process_stats::median;
 
 /// Bytes of a layout on the GPU. Texels are those of bricks; places of a texture that no brick fills are not counted.
@@ -21,6 +24,20 @@ pub struct Bytes {
 }
 
 impl Bytes {
+    /// Those of a pack.
+    pub fn of(pack: &Pack) -> Self {
+        let tree = pack.tree();
+        let records = tree[header::RECORDS] as usize * RECORD_WORDS;
+        let masks = tree[header::MASKS] as usize * MASK_WORDS;
+        let texels = pack.atlases().iter().map(|a| a.bricks as usize * a.codec.layout().brick_bytes());
+        Self {
+            texels: texels.sum::<usize>() as u64,
+            records: records as u64 * 4,
+            tree: (tree.len() - records - masks) as u64 * 4,
+            masks: masks as u64 * 4,
+        }
+    }
+
     pub fn total(&self) -> u64 {
         self.texels + self.records + self.tree + self.masks
     }
@@ -90,20 +107,12 @@ pub fn fog_table(rows: &[Row]) -> String {
     );
     table += &format!("{}|\n", "|---".repeat(16));
     for row in rows {
-        let Row { volume, layout, lookup, coding, bytes, .. } = row;
-        let times = row.times.as_ref();
-        let mb = |bytes: u64| format!("{:.3}", bytes as f64 / 1e6);
+        let Row { volume, layout, lookup, coding, .. } = row;
         // Writing to a string does not fail.
         let _ = writeln!(
             table,
-            "| {volume} | {layout} | {lookup} | {coding} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} | {} |",
-            times.map_or("".to_owned(), |t| format!("{:.4}", t.median)),
-            times.map_or("".to_owned(), |t| percent(t.spread)),
-            mb(bytes.total()),
-            mb(bytes.texels),
-            mb(bytes.records),
-            mb(bytes.tree + bytes.masks),
-            row.bricks,
+            "| {volume} | {layout} | {lookup} | {coding} | {} | {} | {} | {} | {} | {} |",
+            cells_of(row.times.as_ref(), &row.bytes, row.bricks),
             if row.psnr.is_finite() { format!("{:.2}", row.psnr) } else { "exact".to_owned() },
             percent(row.seams.mean),
             percent(row.seams.max),
@@ -112,6 +121,14 @@ pub fn fog_table(rows: &[Row]) -> String {
         );
     }
     table
+}
+
+/// The cells that all tables have: milliseconds, their spread, megabytes and bricks.
+pub fn cells_of(times: Option<&Times>, bytes: &Bytes, bricks: usize) -> String {
+    let mb = |bytes: u64| format!("{:.3}", bytes as f64 / 1e6);
+    let parts = [bytes.total(), bytes.texels, bytes.records, bytes.tree + bytes.masks].map(mb).join(" | ");
+    let timed = times.map_or(" | ".to_owned(), |t| format!("{:.4} | {}", t.median, percent(t.spread)));
+    format!("{timed} | {parts} | {bricks}")
 }
 
 pub fn percent(fraction: f64) -> String {
@@ -170,8 +187,15 @@ impl Run {
 }
 
 /// The Markdown page of a run.
-pub fn page(run: &Run, rows: &[Row]) -> String {
-    format!("# Brick layouts\n\n{}.\n\n{FOG_NOTES}\n\n{}", run.head(), fog_table(rows))
+pub fn page(run: &Run, fog: &[Row], surfaces: &[SurfaceRow]) -> String {
+    let mut page = format!("# Brick layouts\n\n{}.\n", run.head());
+    if !fog.is_empty() {
+        page += &format!("\n## Fog\n\n{FOG_NOTES}\n\n{}", fog_table(fog));
+    }
+    if !surfaces.is_empty() {
+        page += &format!("\n## Level sets\n\n{}\n\n{}", surface::notes(), surface::table(surfaces));
+    }
+    page
 }
 
 const FOG_NOTES: &str = "\
