@@ -4,7 +4,7 @@ use volpack::codec::{BrickRange, Codec};
 use volpack::pack::tree::{NODE_FIRST_RECORD, NODE_MASK_WORDS, NODE_WORDS, ranks};
 use volpack::volume::NODE_CHILDREN;
 
-use super::bricks::{Encoded, Shape};
+use super::bricks::{Encoded, Placed, Shape};
 
 /// Marks a constant in an indirection, and in the links of the tree.
 const CONSTANT: u32 = 1 << 31;
@@ -49,7 +49,7 @@ impl Lookup {
 }
 
 /// Places bricks of one codec in a texture as near to a cube as whole bricks allow. `None` if no brick has that codec.
-pub fn texture(shape: Shape, codec: Codec, bricks: &[([i32; 3], Encoded)]) -> Option<Texture> {
+pub fn texture(shape: Shape, codec: Codec, bricks: &[Placed<Encoded>]) -> Option<Texture> {
     let bricks: Vec<&Encoded> = bricks.iter().map(|(_, brick)| brick).filter(|b| b.codec == codec).collect();
     if bricks.is_empty() {
         return None;
@@ -74,9 +74,9 @@ pub fn texture(shape: Shape, codec: Codec, bricks: &[([i32; 3], Encoded)]) -> Op
 }
 
 /// The first word of each brick's record, with the slot that [`texture`] gives it.
-fn first_words(bricks: &[([i32; 3], Encoded)]) -> Vec<u32> {
+fn first_words(bricks: &[Placed<Encoded>]) -> Vec<u32> {
     let mut slots = [0u32; Codec::COUNT];
-    let word = |(_, brick): &([i32; 3], Encoded)| {
+    let word = |(_, brick): &Placed<Encoded>| {
         let slot = &mut slots[brick.codec as usize];
         *slot += 1;
         brick.codec as u32 | u32::from(brick.axis) << 3 | (*slot - 1) << 5
@@ -93,7 +93,7 @@ fn bounds(places: impl Iterator<Item = [i32; 3]> + Clone) -> ([i32; 3], [u32; 3]
 
 /// One word a brick cell: 0 background, a constant's number, or 1 + the number of a record of two words. `ends` are the first and
 /// the last place that rays may be in.
-pub fn indirection(bricks: &[([i32; 3], Encoded)], ends: [[i32; 3]; 2]) -> Lookup {
+pub fn indirection(bricks: &[Placed<Encoded>], ends: [[i32; 3]; 2]) -> Lookup {
     let (origin, cells) = bounds(bricks.iter().map(|(place, _)| *place).chain(ends));
     let [nx, ny, nz] = cells.map(|n| n as usize);
     let mut words = vec![0; nx * ny * nz];
@@ -128,7 +128,7 @@ pub fn indirection(bricks: &[([i32; 3], Encoded)], ends: [[i32; 3]; 2]) -> Looku
 
 /// A tree as in today's packs, in units of bricks: one L1 node of any size (mask, ranks, a link a child), L2 nodes of 16³
 /// bricks, records of three words, and constants. `ends` as for an indirection.
-pub fn tree(bricks: &[([i32; 3], Encoded)], ends: [[i32; 3]; 2]) -> Lookup {
+pub fn tree(bricks: &[Placed<Encoded>], ends: [[i32; 3]; 2]) -> Lookup {
     let node_of = |place: &[i32; 3]| place.map(|b| b.div_euclid(NODE_DIM));
     let (origin, cells) =
         bounds(bricks.iter().map(|(place, _)| *place).chain(ends).map(|place| node_of(&place)));

@@ -70,6 +70,9 @@ impl Layout {
     }
 }
 
+/// Something of a brick, behind the brick's place: its smallest corner is place · pitch.
+pub type Placed<T> = ([i32; 3], T);
+
 /// What a brick holds. A brick that is all background is left out.
 pub enum Content {
     /// One value everywhere that it is sampled.
@@ -79,7 +82,7 @@ pub enum Content {
 }
 
 /// Cuts a frame into the bricks that are not background, in the order of their places.
-pub fn cut(voxels: &Voxels, shape: Shape) -> Vec<([i32; 3], Content)> {
+pub fn cut(voxels: &Voxels, shape: Shape) -> Vec<Placed<Content>> {
     let Shape { texels, pitch, border } = shape;
     let mut places = BTreeSet::new();
     for covered in voxels.boxes() {
@@ -216,12 +219,12 @@ pub struct Encoded {
 
 /// Encodes bricks. `choices` are those of the adaptive pack.
 pub fn encode(
-    cut: &[([i32; 3], Content)],
+    cut: &[Placed<Content>],
     shape: Shape,
     sequence: &SequenceRange,
     coding: Coding,
     choices: &Choices,
-) -> Result<Vec<([i32; 3], Encoded)>, Box<dyn Error>> {
+) -> Result<Vec<Placed<Encoded>>, Box<dyn Error>> {
     let encoded = cut.par_iter().map(|(place, content)| {
         let values = match content {
             Content::Constant(value) => return Ok((*place, constant(*value))),
@@ -301,7 +304,7 @@ pub struct Decoded<'a> {
 
 impl<'a> Decoded<'a> {
     /// Those bricks.
-    pub fn new(shape: Shape, background: f32, bricks: &'a [([i32; 3], Encoded)]) -> Self {
+    pub fn new(shape: Shape, background: f32, bricks: &'a [Placed<Encoded>]) -> Self {
         Self { shape, background, bricks: bricks.iter().map(|(place, brick)| (*place, brick)).collect() }
     }
 

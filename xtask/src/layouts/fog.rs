@@ -6,7 +6,7 @@ use volpack::codec::{Codec, TexelCodec};
 use volpack::pack::Pack;
 
 use super::atlas::{self, Texture};
-use super::bricks::{self, Choices, Coding, Decoded, Encoded, SHAPES, Shape};
+use super::bricks::{self, Choices, Coding, Decoded, Encoded, Placed, SHAPES, Shape};
 use super::gpu::{Gpu, Program, Textures};
 use super::params::Params;
 use super::quality::{self, Field};
@@ -103,7 +103,7 @@ impl<'a> Fog<'a> {
         let bricks = Choices::of(&pack, &voxels).with_texels();
         let bytes = Bytes::of(&pack);
         let constants =
-            vec![("VP_CODECS", codec_bits(codecs)), ("VP_MASKS", f64::from(u8::from(bytes.masks > 0)))];
+            [("VP_CODECS", codec_bits(codecs)), ("VP_MASKS", f64::from(u8::from(bytes.masks > 0)))];
         let textures = self.gpu.upload(&textures)?;
         let params = Params::new(source, self.size, source.voxels.bounds.min.0, &textures);
         for (keep, layout) in [(false, "fetch, as today"), (true, "fetch, brick kept")] {
@@ -119,7 +119,7 @@ impl<'a> Fog<'a> {
         &mut self,
         shape: Shape,
         coding: Coding,
-        encoded: &[([i32; 3], Encoded)],
+        encoded: &[Placed<Encoded>],
     ) -> Result<(), Box<dyn Error>> {
         let source = self.source;
         let decoded = Decoded::new(shape, source.voxels.background, encoded);

@@ -42,12 +42,9 @@ impl View {
         let d: [f64; 3] = std::array::from_fn(|a| self.forward[a] + self.right[a] * u + self.up[a] * v);
         let length = d.iter().map(|c| c * c).sum::<f64>().sqrt();
         let d = d.map(|c| c / length);
-        let (mut start, mut end) = (0.0f64, f64::INFINITY);
-        for a in 0..3 {
-            let planes = [self.low[a], self.high[a]].map(|plane| (plane - self.origin[a]) / d[a]);
-            start = start.max(planes[0].min(planes[1]));
-            end = end.min(planes[0].max(planes[1]));
-        }
+        let planes = |a: usize| [self.low[a], self.high[a]].map(|plane| (plane - self.origin[a]) / d[a]);
+        let start = (0..3).map(planes).map(|[a, b]| a.min(b)).fold(0.0, f64::max);
+        let end = (0..3).map(planes).map(|[a, b]| a.max(b)).fold(f64::INFINITY, f64::min);
         (d, [start, end])
     }
 
