@@ -37,8 +37,7 @@ pub fn draw(path: &Path, rows: &[Row]) -> Result<(), Box<dyn Error>> {
 type Area<'a> = DrawingArea<SVGBackend<'a>, plotters::coord::Shift>;
 
 fn draw_legend(area: &Area) -> Result<(), Box<dyn Error>> {
-    for (i, coding) in (0..).zip(Coding::ALL) {
-        let x = 20 + 145 * i;
+    for (x, coding) in [20, 190, 290, 380, 470, 560].into_iter().zip(Coding::ALL) {
         area.draw(&Circle::new((x, 18), 6, color(coding.name()).filled()))?;
         area.draw(&Text::new(coding.name(), (x + 12, 11), TEXT))?;
     }
@@ -68,14 +67,15 @@ fn draw_volume(area: &Area, volume: &str, rows: &[&Row]) -> Result<(), Box<dyn E
         .configure_mesh()
         .x_desc("MB on the GPU: texels, records, tree or indirection")
         .y_desc("milliseconds a frame")
+        .x_labels(6)
         .label_style(TEXT)
         .light_line_style(WHITE)
         .draw()?;
     chart.draw_series(rows.iter().map(|row| {
-        let radius = 4.0 + 8.0 * (row.seams.mean / 0.002).min(2.0);
+        let radius = (4.0 + 8.0 * (row.seams.mean / 0.002).min(2.0)).round() as i32;
         EmptyElement::at(place(row))
-            + Circle::new((0, 0), radius.round() as i32, color(&row.coding).mix(0.75).filled())
-            + Text::new(label(row), (8, -6), ("sans-serif", 13))
+            + Circle::new((0, 0), radius, color(&row.coding).mix(0.75).filled())
+            + Text::new(label(row), (radius + 2, -6), ("sans-serif", 13))
     }))?;
     Ok(())
 }

@@ -5,6 +5,8 @@ override SKIP: bool = false;
 
 fn march(ray: Ray) -> f32 {
     let inverse = params.atlases[2].inverse;
+    let origin = (ray.origin + 1.5) * inverse;
+    let step = ray.step * inverse;
     var texels = 0.0;
     var count = 0;
     var k = 0;
@@ -20,7 +22,7 @@ fn march(ray: Ray) -> f32 {
         }
         count += end - k;
         while k < end {
-            texels += textureSampleLevel(unorm8_texels, trilinear, (place(ray, k) + 1.5) * inverse, 0.0).x;
+            texels += textureSampleLevel(unorm8_texels, trilinear, origin + step * f32(k), 0.0).x;
             k++;
         }
     }
