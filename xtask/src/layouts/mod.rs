@@ -19,14 +19,13 @@ mod voxels;
 use std::error::Error;
 use std::path::PathBuf;
 
-use serde_json::json;
 use volpack::sweep::steady;
 
 use self::fog::Fog;
 use self::gpu::{Gpu, Kernel};
 use self::nanovdb::{March, Peer};
 use self::quality::{apart, mean};
-use self::report::{Bytes, Row, Run, Times};
+use self::report::{Bytes, Report, Row, Run, Times};
 use self::source::Source;
 use self::surface::Traced;
 use crate::peer_programs;
@@ -109,53 +108,84 @@ pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
         _ if args.check => [96, 54],
         _ => [1920, 1080],
     };
-    let run = Run::new(&gpu.info, size, args.repeats, args.rounds)?;
-    println!("{}\n", run.head());
+    let mut report = Report::new(Run::new(&gpu.info, size, args.repeats, args.rounds)?);
+    println!("{}\n", report.run.head());
     let peers = peers(args);
     if let Err(reason) = &peers {
         println!("NanoVDB is not measured: {reason}\n");
     }
     let peers = peers.unwrap_or_default();
-    let (mut fog, mut surfaces, mut wrong) = (Vec::new(), Vec::new(), 0);
+    let mut wrong = 0;
     for path in &args.files {
         let source = Source::open(path, size)?;
-        if source.level_set {
-            let (mut rows, mut makers) = surface::rows(&mut gpu, &source, size)?;
-            if args.check {
-                wrong += surface::check(&rows);
-            } else {
-                let times = time(&gpu, args, makers.iter_mut())?;
-                rows.iter_mut().zip(times).for_each(|(row, times)| row.times = Some(times));
-            }
-            println!("{}", surface::table(&rows));
-            surfaces.extend(rows);
-            continue;
-        }
-        let mut entries = Fog::rows(&mut gpu, &source, size, args.check)?;
-        for peer in &peers {
-            nanovdb_rows(peer, &source, size, &mut entries)?;
-        }
-        if args.check {
-            wrong += check(&entries);
+        wrong += if source.level_set {
+            level_set(&mut gpu, args, &source, size, &mut report)?
         } else {
-            let times = time(&gpu, args, entries.iter_mut().map(|entry| &mut entry.maker))?;
-            entries.iter_mut().zip(times).for_each(|(entry, times)| entry.row.times = Some(times));
-        }
-        let rows: Vec<Row> = entries.into_iter().map(|entry| entry.row).collect();
-        println!("{}", report::fog_table(&rows));
-        fog.extend(rows);
+            fog(&mut gpu, args, &source, size, &peers, &mut report)?
+        };
+        // After each volume, so that a failure loses one.
+        write(args, &report)?;
     }
-    if let Some(page) = &args.page {
-        std::fs::write(page, report::page(&run, &fog, &surfaces))?;
-    }
-    if let Some(svg) = &args.chart {
-        chart::draw(svg, &fog)?;
-    }
-    peer_programs::write(args.json.as_deref(), &json!({ "run": run, "fog": fog, "level_sets": surfaces }))?;
     if wrong > 0 {
         return Err(format!("{wrong} pictures differ from what their texels decode to").into());
     }
     Ok(())
+}
+
+/// Measures a level set, and returns how many pictures are wrong.
+fn level_set(
+    gpu: &mut Gpu,
+    args: &Args,
+    source: &Source,
+    size: [u32; 2],
+    report: &mut Report,
+) -> Result<usize, Box<dyn Error>> {
+    let (mut rows, mut makers) = surface::rows(gpu, source, size)?;
+    if !args.check {
+        let times = time(gpu, args, makers.iter_mut())?;
+        rows.iter_mut().zip(times).for_each(|(row, times)| row.times = Some(times));
+    }
+    println!("{}", surface::table(&rows));
+    let wrong = if args.check { surface::check(&rows) } else { 0 };
+    report.level_sets.extend(rows);
+    Ok(wrong)
+}
+
+/// Measures a fog volume, and returns how many pictures are wrong.
+fn fog(
+    gpu: &mut Gpu,
+    args: &Args,
+    source: &Source,
+    size: [u32; 2],
+    peers: &[Peer],
+    report: &mut Report,
+) -> Result<usize, Box<dyn Error>> {
+    let mut entries = Fog::rows(gpu, source, size, args.check)?;
+    for peer in peers {
+        nanovdb_rows(peer, source, size, &mut entries)?;
+    }
+    let mut wrong = 0;
+    if args.check {
+        wrong = check(&entries);
+    } else {
+        let times = time(gpu, args, entries.iter_mut().map(|entry| &mut entry.maker))?;
+        entries.iter_mut().zip(times).for_each(|(entry, times)| entry.row.times = Some(times));
+    }
+    let rows: Vec<Row> = entries.into_iter().map(|entry| entry.row).collect();
+    println!("{}", report::fog_table(&rows));
+    report.fog.extend(rows);
+    Ok(wrong)
+}
+
+fn write(args: &Args, report: &Report) -> Result<(), Box<dyn Error>> {
+    peer_programs::write(args.json.as_deref(), &serde_json::to_value(report)?)?;
+    if let Some(page) = &args.page {
+        std::fs::write(page, report.page())?;
+    }
+    match &args.chart {
+        Some(svg) if report.fog.iter().any(|row| row.times.is_some()) => chart::draw(svg, &report.fog),
+        _ => Ok(()),
+    }
 }
 
 fn peers(args: &Args) -> Result<Vec<Peer>, Box<dyn Error>> {
@@ -204,7 +234,10 @@ fn time<'a>(
 ) -> Result<Vec<Times>, Box<dyn Error>> {
     let mut makers: Vec<&mut Maker> = makers.collect();
     if let Some(first) = makers.first_mut() {
-        steady(args.repeats, |frames| first.time(gpu, frames))?;
+        let warm = steady(args.repeats, |frames| first.time(gpu, frames))?;
+        if !warm.is_steady {
+            println!("The clocks did not settle: the medians of the warm-up never agreed.\n");
+        }
     }
     let mut rounds = vec![Vec::new(); makers.len()];
     for _ in 0..args.rounds {

@@ -186,16 +186,32 @@ impl Run {
     }
 }
 
-/// The Markdown page of a run.
-pub fn page(run: &Run, fog: &[Row], surfaces: &[SurfaceRow]) -> String {
-    let mut page = format!("# Brick layouts\n\n{}.\n", run.head());
-    if !fog.is_empty() {
-        page += &format!("\n## Fog\n\n{FOG_NOTES}\n\n{}", fog_table(fog));
+/// All that a run measured.
+#[derive(Serialize)]
+pub struct Report {
+    pub run: Run,
+    pub fog: Vec<Row>,
+    pub level_sets: Vec<SurfaceRow>,
+}
+
+impl Report {
+    /// One without figures.
+    pub fn new(run: Run) -> Self {
+        Self { run, fog: Vec::new(), level_sets: Vec::new() }
     }
-    if !surfaces.is_empty() {
-        page += &format!("\n## Level sets\n\n{}\n\n{}", surface::notes(), surface::table(surfaces));
+
+    /// The Markdown page.
+    pub fn page(&self) -> String {
+        let mut page = format!("# Brick layouts\n\n{}.\n", self.run.head());
+        if !self.fog.is_empty() {
+            page += &format!("\n## Fog\n\n{FOG_NOTES}\n\n{}", fog_table(&self.fog));
+        }
+        if !self.level_sets.is_empty() {
+            page +=
+                &format!("\n## Level sets\n\n{}\n\n{}", surface::notes(), surface::table(&self.level_sets));
+        }
+        page
     }
-    page
 }
 
 const FOG_NOTES: &str = "\
