@@ -28,6 +28,8 @@ pub const VOLPACK_WGSL: &str = concat!(
 );
 /// `tracer.wgsl`, which goes with it.
 pub const TRACER_WGSL: &str = include_str!("shaders/tracer.wgsl");
+/// `cubic.wgsl`, with which the tracer finds surfaces.
+pub const CUBIC_WGSL: &str = include_str!("shaders/cubic.wgsl");
 
 /// A device that can trace.
 pub struct Gpu {

@@ -8,6 +8,7 @@ mod clusters;
 mod corpus;
 mod formats;
 mod kmeans;
+mod layouts;
 mod load;
 mod mutate;
 mod openvdb;
@@ -98,6 +99,9 @@ enum Bench {
     Pictures(pictures::Args),
     /// Milliseconds per frame on a GPU: every format, with DDA and HDDA, at 1920 × 1080
     Trace(trace::Args),
+    /// Milliseconds per frame on a GPU: brick layouts that the next pack format might have, sampled with trilinear
+    /// filtering, with their bytes, seams and PSNR
+    Layouts(layouts::Args),
     /// Charts of quality against size, build time and trace time, or of stability
     Sweep(sweep::Args),
 }
@@ -116,6 +120,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         Task::Bench(Bench::Size(args)) => size::bench(&args),
         Task::Bench(Bench::Pictures(args)) => pictures::bench(&args),
         Task::Bench(Bench::Trace(args)) => trace::bench(&args),
+        Task::Bench(Bench::Layouts(args)) => layouts::bench(&args),
         Task::Bench(Bench::Sweep(args)) => sweep::bench(&args),
         Task::Corpus(args) => corpus::run(&args),
         Task::Chart { json, svg } => chart(&json, &svg),

@@ -60,21 +60,29 @@ pub fn compile_nanovdb(headers: Option<&Path>) -> Result<(PathBuf, String), Box<
     let folder = root().join("target/peers");
     std::fs::create_dir_all(&folder)?;
     let fresh = folder.join("nanovdb_trace");
+    let version = nvcc(&root().join("benches/peers/nanovdb_trace.cu"), headers, &fresh)?;
+    let program = folder.join(format!("nanovdb_trace-{version}"));
+    std::fs::rename(&fresh, &program)?;
+    Ok((program, version))
+}
+
+/// Compiles a CUDA program that uses NanoVDB for the GPU of this machine, and returns NanoVDB's version.
+///
+/// # Errors
+/// When there is no CUDA compiler or no NanoVDB: the message says what to install.
+pub fn nvcc(source: &Path, headers: Option<&Path>, program: &Path) -> Result<String, Box<dyn Error>> {
     let mut compiler = Command::new("nvcc");
     compiler.args(["-O3", "-std=c++17", "-arch=native", "--extended-lambda"]);
     if let Some(headers) = headers {
         compiler.arg("-I").arg(headers);
     }
-    let status = compiler.arg(root().join("benches/peers/nanovdb_trace.cu")).arg("-o").arg(&fresh).status();
+    let status = compiler.arg(source).arg("-o").arg(program).status();
     if !status.is_ok_and(|status| status.success()) {
         return Err("nvcc or NanoVDB is not installed: the CUDA toolkit, and apt-get install libnanovdb-dev libnanovdb-tools"
             .into());
     }
     // Without arguments, it prints only its version.
-    let version = String::from_utf8(Command::new(&fresh).output()?.stdout)?.trim().to_owned();
-    let program = folder.join(format!("nanovdb_trace-{version}"));
-    std::fs::rename(&fresh, &program)?;
-    Ok((program, version))
+    Ok(String::from_utf8(Command::new(program).output()?.stdout)?.trim().to_owned())
 }
 
 /// The release binary of volpack in this repository.

@@ -7,10 +7,10 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Command, Stdio};
 
 use serde_json::{Value as Json, json};
-use volpack::pack::Pack;
+use volpack::pack::{Grid, Pack};
 use volpack::pipeline::{Job, Silent, VerifyLevel, build};
 use volpack::render::gpu::Gpu;
-use volpack::render::{Image, Interpolation, Lens, Mode, Scene, Traversal, View};
+use volpack::render::{Image, Interpolation, Lens, Mode, Scene, Traversal, Up, View, WorldBox};
 use volpack::settings::{Format, Settings};
 use volpack::sweep::nanovdb::{self, Quantise};
 use volpack::sweep::{Steady, steady};
@@ -40,6 +40,12 @@ pub struct Args {
 
 /// Along (-0.6, -0.35, -0.72) from one diagonal away.
 const VIEW: View = View::Orbit { azimuth: 39.8056, elevation: 20.4927, distance: Some(1.0) };
+
+/// The benchmarks' picture of a grid's first frame. The camera is the same for all volumes, whatever is up in them.
+pub fn scene(grid: &Grid, mode: Mode, size: [u32; 2]) -> Scene {
+    let camera = VIEW.camera(&WorldBox::of_grid(grid), Up::Y, size);
+    Scene { camera, ..Scene::new(grid, 0, &VIEW, mode, size) }
+}
 
 /// What is shown of a level set or of fog: its name, which is the peer's word too, and how.
 type Shown = (&'static str, Mode, Interpolation);
@@ -122,7 +128,7 @@ impl Bench<'_> {
         }
         let grid = &packs[0].1.grids()[0];
         for &(shows, mode, interpolation) in if grid.is_level_set() { LEVEL_SET } else { FOG } {
-            let scene = Scene { interpolation, ..Scene::new(grid, 0, &VIEW, mode, self.size) };
+            let scene = Scene { interpolation, ..scene(grid, mode, self.size) };
             let theirs = self.theirs(path, &grid.name, shows, &scene)?;
             for (format, pack) in &packs {
                 self.row((&name, shows, *format), pack, &scene, &theirs)?;
