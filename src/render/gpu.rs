@@ -18,14 +18,11 @@ use crate::volume::CoordBox;
 
 pub use super::gpu_error::GpuError;
 
-/// `volpack.wgsl`, `hdda.wgsl` and `march.wgsl`, what an engine takes over.
-pub const VOLPACK_WGSL: &str = concat!(
-    include_str!("shaders/volpack.wgsl"),
-    "\n",
-    include_str!("shaders/hdda.wgsl"),
-    "\n",
-    include_str!("shaders/march.wgsl")
-);
+/// `volpack.wgsl` and `hdda.wgsl`, what an engine takes over.
+pub const VOLPACK_WGSL: &str =
+    concat!(include_str!("shaders/volpack.wgsl"), "\n", include_str!("shaders/hdda.wgsl"));
+/// `march.wgsl`, what an engine takes over as well to light fog.
+pub const MARCH_WGSL: &str = include_str!("shaders/march.wgsl");
 /// `tracer.wgsl`, which goes with it.
 pub const TRACER_WGSL: &str = include_str!("shaders/tracer.wgsl");
 /// `cubic.wgsl`, with which the tracer finds surfaces.

@@ -14,7 +14,7 @@ use crate::render::decoded_frame::Content;
 use crate::render::image::BACKDROP;
 use crate::render::scene::RAMP_STEPS;
 use crate::render::traverse::{Box3, Ray, Real, Walk};
-use crate::volume::{BRICK_DIM, Coord};
+use crate::volume::Coord;
 
 /// Optical depth at which a ray ends. The transmittance is then 0.001, below half of an 8-bit step.
 const OPAQUE: f64 = 7.0;
@@ -91,57 +91,47 @@ impl<'a, F: Real> Tracer<'a, F> {
         Samples { step, offset }
     }
 
-    /// Calls `sample` with `t` and density of each sample along a ray, until it returns false. Empty regions are skipped,
-    /// unless there is emission.
+    /// Calls `sample` with position, and density there, of each sample along a ray, until it returns false. Empty nodes are
+    /// skipped, unless there is emission.
     fn march(
         &self,
         ray: &Ray<F>,
         samples: &Samples<F>,
         visited: &mut Visited<'a>,
-        mut sample: impl FnMut(F, F, &mut Visited<'a>) -> bool,
+        mut sample: impl FnMut([F; 3], F, &mut Visited<'a>) -> bool,
     ) {
         let bounds = self.setup.bounds;
-        let Some(mut walk) = Walk::enter(ray, bounds) else { return };
+        let Some(walk) = Walk::enter(ray, bounds) else { return };
+        let (end, _) = walk.exit(ray, bounds);
         let mut next = samples.not_before(walk.t);
-        while bounds.contains(walk.cell) && visited.steps < MAX_STEPS {
+        while samples.at(next) < end && visited.steps < MAX_STEPS {
             visited.steps += 1;
-            let (node, constant, value) = self.node(walk.cell, visited);
+            let t = samples.at(next);
+            next = next + F::from_i32(1);
+            let p: [F; 3] = std::array::from_fn(|a| ray.origin[a] + ray.direction[a] * t);
+            // Rounding may put p just outside the box.
+            let cell = std::array::from_fn(|a| p[a].floor_i32().clamp(bounds.min[a], bounds.max[a] - 1));
+            let (node, constant, value) = self.node(cell, visited);
             // A cell has the next voxels as corners, so the last layer of a node's cells is not constant, unless the nodes
             // around it are background too.
-            let alone = constant && self.is_alone(walk.cell, visited);
+            let alone = constant && self.is_alone(cell, visited);
             let inner = Box3 { min: node.min, max: node.max.map(|v| v - i32::from(!alone)) };
-            let is_inner = constant && inner.contains(walk.cell);
-            let region = if is_inner { inner } else { self.block(walk.cell) }.within(bounds);
-            walk.leave(ray, region);
+            let is_inner = constant && inner.contains(cell);
             if is_inner && value <= 0.0 && self.emission.is_none() {
-                next = samples.not_before(walk.t);
+                let behind = samples.not_before(walk.exit(ray, inner).0);
+                next = if behind > next { behind } else { next };
                 continue;
             }
-            while samples.at(next) < walk.t && visited.steps < MAX_STEPS {
-                visited.steps += 1;
-                let t = samples.at(next);
-                let value =
-                    if is_inner { F::from_f64(value.into()) } else { self.between(ray, t, region, visited) };
-                if !sample(t, value, visited) {
-                    return;
-                }
-                next = next + F::from_i32(1);
+            let density = if is_inner {
+                F::from_f64(value.into())
+            } else {
+                let within = std::array::from_fn(|a| p[a] - F::from_i32(cell[a]));
+                interpolate(self.corners(cell, visited), within)
+            };
+            if !sample(p, density, visited) {
+                return;
             }
         }
-    }
-
-    /// The block of 8³ cells around a cell.
-    fn block(&self, cell: [i32; 3]) -> Box3 {
-        let voxel = self.voxel(cell).align_down(BRICK_DIM);
-        Box3::cube(std::array::from_fn(|a| voxel.0[a] - self.setup.base[a]), BRICK_DIM)
-    }
-
-    /// The interpolated density at `t`. Rounding may put it just outside the region.
-    fn between(&self, ray: &Ray<F>, t: F, region: Box3, visited: &mut Visited<'a>) -> F {
-        let p: [F; 3] = std::array::from_fn(|a| ray.origin[a] + ray.direction[a] * t);
-        let cell = std::array::from_fn(|a| p[a].floor_i32().clamp(region.min[a], region.max[a] - 1));
-        let within = std::array::from_fn(|a| p[a] - F::from_i32(cell[a]));
-        interpolate(self.corners(cell, visited), within)
     }
 
     /// The ray-marched integral of density over distance, up to where the fog is opaque.
@@ -168,8 +158,7 @@ impl<'a, F: Real> Tracer<'a, F> {
         let mut light = [zero; 3];
         let mut depth = zero;
         let mut through = one;
-        self.march(ray, &samples, visited, |t, value, visited| {
-            let p: [F; 3] = std::array::from_fn(|a| ray.origin[a] + ray.direction[a] * t);
+        self.march(ray, &samples, visited, |p, value, visited| {
             let thickness = if value > zero { value * samples.step * self.extinction } else { zero };
             depth = depth + thickness;
             let left = (-depth).exp();
@@ -229,7 +218,9 @@ impl<'a, F: Real> Tracer<'a, F> {
         };
         let value = interpolate(std::array::from_fn(value), within) * F::from_f64(emission.per_unit);
         let place = value * F::from_i32(RAMP_STEPS as i32 - 1);
-        if !(place > F::from_i32(0)) {
+        // Not a number does not emit.
+        let emits = place > F::from_i32(0);
+        if !emits {
             return None;
         }
         let low = place.floor_i32().min(RAMP_STEPS as i32 - 2);

@@ -7,7 +7,7 @@ use std::collections::HashMap;
 use std::fmt::Write;
 use std::sync::{Mutex, PoisonError};
 
-use super::{CUBIC_WGSL, TRACER_WGSL, VOLPACK_WGSL};
+use super::{CUBIC_WGSL, MARCH_WGSL, TRACER_WGSL, VOLPACK_WGSL};
 use crate::codec::Codec;
 use crate::pack::Pack;
 use crate::pack::tree::header;
@@ -72,7 +72,8 @@ impl Pipelines {
         let shader = wgpu::ShaderModuleDescriptor {
             label: Some("volpack + tracer"),
             source: wgpu::ShaderSource::Wgsl(
-                format!("{VOLPACK_WGSL}\n{CUBIC_WGSL}\n{TRACER_WGSL}\n{}", texels_wgsl()).into(),
+                format!("{VOLPACK_WGSL}\n{MARCH_WGSL}\n{CUBIC_WGSL}\n{TRACER_WGSL}\n{}", texels_wgsl())
+                    .into(),
             ),
         };
         // What wgpu adds to loops, to keep foreign shaders from running for ever, costs this one a sixth

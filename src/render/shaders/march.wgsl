@@ -104,72 +104,70 @@ struct VpMarched {
     depth: f32,         // optical depth
 }
 
+// When a ray leaves the box from low to high.
+fn vp_exit(ray: VpRay, low: vec3i, high: vec3i) -> f32 {
+    return vp_least(vp_crossings(ray, select(low, high, ray.forward)));
+}
+
 // The number of the first sample that is not before t.
 fn vp_sample_from(t: f32, step: f32, offset: f32) -> f32 {
     return ceil(t / step - offset);
 }
 
-// Samples are at t = (number + offset) · step.
+// Samples are at t = (number + offset) · step. Each looks up its node anew: a second loop that kept a brick while the ray
+// is in it takes 1.6 to 2.6 times as long, because neighbouring rays then no longer sample together.
 fn vp_march(fog: VpFog, ray: VpRay, offset: f32) -> VpMarched {
     var light = vec3f(0.0);
     var depth = 0.0;
     var through = 1.0;
-    var walk = vp_enter(ray, fog.low, fog.high);
+    let walk = vp_enter(ray, fog.low, fog.high);
     if !vp_traced(fog, walk) {
         return VpMarched(light, depth);
     }
     let g = vp_grid(fog.grid);
+    let end = vp_exit(ray, fog.low, fog.high);
     var l2 = VP_NOWHERE;
     var next = vp_sample_from(walk.t, fog.step, offset);
-    while vp_traced(fog, walk) && depth < VP_OPAQUE {
+    while depth < VP_OPAQUE && vp_steps < VP_MAX_STEPS {
+        let t = (next + offset) * fog.step;
+        if t >= end {
+            break;
+        }
         vp_steps++;
-        let at = vp_place(fog, g, l2, walk.cell);
-        l2 = at.cell;
+        next += 1.0;
+        let p = ray.origin + ray.direction * t;
+        // Rounding may put p just outside the box.
+        let cell = clamp(vec3i(floor(p)), fog.low, fog.high - 1);
+        let voxel = cell + fog.base;
+        l2 = vp_cell(g, fog.frame, l2, voxel);
+        let node = vp_find(g, l2, voxel);
+        var density = node.value;
         // A cell has the next voxels as corners, so the last layer of a node's cells is not constant, unless the nodes
         // around it are background too.
-        let skips = VP_SKIPS && at.node.constant;
-        let alone = skips && at.node.dim == 8 && vp_alone(l2, walk.cell + fog.base);
-        let inner = min(at.high, at.node.min - fog.base + at.node.dim - select(1, 0, alone));
-        let is_inner = skips && vp_inside(walk.cell, at.low, inner);
-        let block = ((walk.cell + fog.base) & vec3i(-8)) - fog.base;
-        let low = select(max(block, at.low), at.low, is_inner);
-        let high = select(min(block + 8, at.high), inner, is_inner);
-        walk = vp_leave(ray, walk, low, high);
-        if !VP_EMITS && is_inner && at.node.value <= 0.0 {
-            next = vp_sample_from(walk.t, fog.step, offset);
-            continue;
+        let skips = VP_SKIPS && node.constant;
+        let alone = skips && node.dim == 8 && vp_alone(l2, voxel);
+        let low = node.min - fog.base;
+        let inner = low + node.dim - select(1, 0, alone);
+        if skips && all(cell < inner) {
+            if !VP_EMITS && density <= 0.0 {
+                next = max(next, vp_sample_from(vp_exit(ray, low, inner), fog.step, offset));
+                continue;
+            }
+        } else {
+            density = vp_between(vp_corners(g, fog.frame, l2, vp_brick(g, node), voxel), p - vec3f(cell));
         }
-        let brick = vp_brick(g, at.node);
-        loop {
-            let t = (next + offset) * fog.step;
-            if t >= walk.t || vp_steps >= VP_MAX_STEPS {
-                break;
+        let thickness = max(density, 0.0) * fog.step * fog.extinction;
+        depth += thickness;
+        if VP_LIT {
+            let left = exp(-depth);
+            if thickness > 0.0 {
+                light += (through - left) * (fog.sun * exp(-vp_depth_to_sun(p)) + fog.sky);
             }
-            vp_steps++;
-            next += 1.0;
-            let p = ray.origin + ray.direction * t;
-            var value = at.node.value;
-            if !is_inner {
-                // Rounding may put p just outside the region.
-                let cell = clamp(vec3i(floor(p)), low, high - 1);
-                value = vp_between(vp_corners(g, fog.frame, l2, brick, cell + fog.base), p - vec3f(cell));
+            if VP_EMITS {
+                let seen = select((through - left) / thickness, through, thickness < VP_CLEAR);
+                light += vp_emission(p) * (fog.step * seen);
             }
-            let thickness = max(value, 0.0) * fog.step * fog.extinction;
-            depth += thickness;
-            if VP_LIT {
-                let left = exp(-depth);
-                if thickness > 0.0 {
-                    light += (through - left) * (fog.sun * exp(-vp_depth_to_sun(p)) + fog.sky);
-                }
-                if VP_EMITS {
-                    let seen = select((through - left) / thickness, through, thickness < VP_CLEAR);
-                    light += vp_emission(p) * (fog.step * seen);
-                }
-                through = left;
-            }
-            if depth >= VP_OPAQUE {
-                break;
-            }
+            through = left;
         }
     }
     return VpMarched(light, depth);

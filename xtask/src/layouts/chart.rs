@@ -15,7 +15,9 @@ const TEXT: (&str, i32) = ("sans-serif", 16);
 
 /// Draws the rows that were timed. Volumes lie below each other.
 pub fn draw(path: &Path, rows: &[Row]) -> Result<(), Box<dyn Error>> {
-    let timed: Vec<&Row> = rows.iter().filter(|row| row.times.is_some() && row.coding != "f32").collect();
+    // An indirection is where its tree is, a little lower, and would hide it.
+    let is_drawn = |row: &&Row| row.coding != "f32" && (row.lookup == "tree" || row.layout == "dense");
+    let timed: Vec<&Row> = rows.iter().filter(|row| row.times.is_some()).filter(is_drawn).collect();
     let mut volumes: Vec<&str> = timed.iter().map(|row| row.volume.as_str()).collect();
     volumes.dedup();
     let height = LEGEND + PANEL[1] * volumes.len() as u32;
@@ -38,7 +40,7 @@ fn draw_legend(area: &Area) -> Result<(), Box<dyn Error>> {
         area.draw(&Circle::new((x, 18), 6, color(coding.name()).filled()))?;
         area.draw(&Text::new(coding.name(), (x + 12, 11), TEXT))?;
     }
-    let key = "Labels: texels along a brick (8, 9, 10, 16), i: indirection, t: tree; F: fetch, K: fetch, brick kept; D: dense, S: skipping";
+    let key = "Labels: texels along a filtered brick (8, 9, 10, 16); F: fetch, K: fetch, brick kept; D: dense texture, S: the same, empty regions skipped";
     area.draw(&Text::new(key, (14, 34), TEXT))?;
     let size =
         "A point grows with its mean jump between bricks: 4 px are none, 12 px are 0.2 % of the grid's range";
@@ -78,12 +80,11 @@ fn draw_volume(area: &Area, volume: &str, rows: &[&Row]) -> Result<(), Box<dyn E
 }
 
 fn label(row: &Row) -> String {
-    let lookup = &row.lookup[..1];
     match row.layout.split_once('³') {
-        Some((texels, _)) => format!("{texels}{lookup}"),
+        Some((texels, _)) => texels.to_owned(),
         None if row.layout.ends_with("kept") => "K".to_owned(),
         None if row.layout.starts_with("fetch") => "F".to_owned(),
-        None if row.layout == "dense" && lookup == "i" => "S".to_owned(),
+        None if row.layout == "dense" && row.lookup == "indirection" => "S".to_owned(),
         None if row.layout == "dense" => "D".to_owned(),
         None => row.layout.clone(),
     }

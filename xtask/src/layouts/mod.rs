@@ -37,8 +37,11 @@ const STEP: f64 = 0.5;
 #[derive(clap::Args)]
 pub struct Args {
     /// OpenVDB files
-    #[arg(required = true)]
+    #[arg(required_unless_present = "redraw")]
     files: Vec<PathBuf>,
+    /// Only write page and chart again, from the JSON of an earlier run
+    #[arg(long, value_name = "JSON", conflicts_with_all = ["files", "json"])]
+    redraw: Option<PathBuf>,
     /// Frames of each row in a round
     #[arg(long, default_value_t = 50)]
     repeats: u32,
@@ -92,6 +95,9 @@ impl Maker {
 }
 
 pub fn bench(args: &Args) -> Result<(), Box<dyn Error>> {
+    if let Some(json) = &args.redraw {
+        return write(args, &serde_json::from_slice(&std::fs::read(json)?)?);
+    }
     let mut gpu = Gpu::open()?;
     if gpu.is_software() && !args.check {
         let name = &gpu.info.name;

@@ -3,7 +3,7 @@
 use rand::{Rng, SeedableRng};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use rayon::prelude::*;
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use volpack::volume::CoordBox;
 
 use super::bricks::Decoded;
@@ -18,7 +18,7 @@ const FACE: usize = 8;
 pub type Field<'a> = &'a (dyn Fn([f64; 3]) -> f64 + Sync);
 
 /// Jumps of the field across the faces between bricks that have texels, as fractions of the grid's range.
-#[derive(Clone, Copy, Debug, Default, Serialize)]
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct Seams {
     pub mean: f64,
     pub max: f64,
@@ -75,7 +75,7 @@ pub fn march(field: Field, view: &View, size: [u32; 2], step: f64) -> Vec<f32> {
 }
 
 /// How far pictures are apart, as fractions of the largest value of the second. The mean is over pixels that are not 0 in it.
-#[derive(Clone, Copy, Debug, Default, Serialize)]
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct Apart {
     pub mean: f64,
     pub max: f64,

@@ -4,7 +4,7 @@ use std::error::Error;
 use std::fmt::Write;
 use std::process::Command;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use volpack::pack::Pack;
 use volpack::pack::tree::{MASK_WORDS, RECORD_WORDS, header};
 
@@ -14,7 +14,7 @@ use super::surface::{self, SurfaceRow};
 use crate::process_stats::median;
 
 /// Bytes of a layout on the GPU. Texels are those of bricks; places of a texture that no brick fills are not counted.
-#[derive(Clone, Copy, Debug, Serialize)]
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct Bytes {
     pub texels: u64,
     pub records: u64,
@@ -44,7 +44,7 @@ impl Bytes {
 }
 
 /// Milliseconds of a frame: a median for each round, and what they come to.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Times {
     pub rounds: Vec<f64>,
     pub median: f64,
@@ -53,7 +53,7 @@ pub struct Times {
 }
 
 /// One layout with one coding of one volume.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Row {
     pub volume: String,
     pub layout: String,
@@ -63,7 +63,8 @@ pub struct Row {
     pub bricks: usize,
     pub bytes: Bytes,
     pub seams: Seams,
-    pub psnr: f64,
+    /// Of filtered values, in dB; none without a difference.
+    pub psnr: Option<f64>,
     /// The mean of the picture: density · voxels.
     pub mean: f64,
     /// How far the picture is from that of the f32 pack, and from one that the CPU makes of the same texels.
@@ -91,7 +92,7 @@ impl Row {
             bricks,
             bytes,
             seams: Seams::default(),
-            psnr,
+            psnr: Some(psnr).filter(|psnr| psnr.is_finite()),
             mean: 0.0,
             picture: Apart::default(),
             model: None,
@@ -113,7 +114,7 @@ pub fn fog_table(rows: &[Row]) -> String {
             table,
             "| {volume} | {layout} | {lookup} | {coding} | {} | {} | {} | {} | {} | {} |",
             cells_of(row.times.as_ref(), &row.bytes, row.bricks),
-            if row.psnr.is_finite() { format!("{:.2}", row.psnr) } else { "exact".to_owned() },
+            row.psnr.map_or("exact".to_owned(), |psnr| format!("{psnr:.2}")),
             percent(row.seams.mean),
             percent(row.seams.max),
             percent(row.picture.mean),
@@ -145,7 +146,7 @@ impl Times {
 }
 
 /// When, where and how a benchmark ran.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct Run {
     date: String,
     device: String,
@@ -187,7 +188,7 @@ impl Run {
 }
 
 /// All that a run measured.
-#[derive(Serialize)]
+#[derive(Serialize, Deserialize)]
 pub struct Report {
     pub run: Run,
     pub fog: Vec<Row>,
@@ -202,7 +203,7 @@ impl Report {
 
     /// The Markdown page.
     pub fn page(&self) -> String {
-        let mut page = format!("# Brick layouts\n\n{}.\n", self.run.head());
+        let mut page = format!("# Brick layouts\n\n{}. Written by `xtask bench layouts`.\n", self.run.head());
         if !self.fog.is_empty() {
             page += &format!("\n## Fog\n\n{FOG_NOTES}\n\n{}", fog_table(&self.fog));
         }

@@ -3,7 +3,7 @@
 use std::error::Error;
 use std::fmt::Write;
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use volpack::codec::{Codec, TexelCodec};
 use volpack::pack::Pack;
 use volpack::render::gpu::{CUBIC_WGSL, Gpu as Tracer, Uploaded};
@@ -38,7 +38,7 @@ const CODINGS: [Coding; 4] = [
 type Pixel = [f32; 4];
 
 /// A mean, the value that 99 of 100 are below, and the largest.
-#[derive(Clone, Copy, Debug, Default, Serialize)]
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct Spread {
     pub mean: f64,
     pub p99: f64,
@@ -46,7 +46,7 @@ pub struct Spread {
 }
 
 /// How far a picture is from the reference, over pixels that hit in both.
-#[derive(Clone, Copy, Debug, Default, Serialize)]
+#[derive(Clone, Copy, Debug, Default, Serialize, Deserialize)]
 pub struct Errors {
     /// In voxels.
     pub depth: Spread,
@@ -59,7 +59,7 @@ pub struct Errors {
 }
 
 /// One method with one coding of one level set.
-#[derive(Clone, Debug, Serialize)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub struct SurfaceRow {
     pub volume: String,
     pub method: String,
