@@ -309,15 +309,24 @@ fn pictures_are_rendered_compared_and_kept() {
     }
     stdout(&render(&["--size", "48x32", "--frames", "all"]));
     assert_eq!(size(), [4 * 48, 2 * 32]);
+    stdout(&render(&[
+        "--size", "48x32", "--frames", "2-8:3,1", "--up", "z", "--step", "0.3world", "--jitter",
+    ]));
+    assert_eq!(size(), [2 * 48, 2 * 32], "frames 2, 5, 8 and 1");
     for (wrong, part) in [
         (vec!["--frame", "77"], "it has 1 to 8"),
         (vec!["--grid", "heat"], "it has density"),
+        (vec!["--frames", "20-24"], "no frame from 20 to 24; it has 1 to 8"),
         (vec!["--camera", "orbit:1"], "orbit:AZIMUTH"),
+        (vec!["--step", "0"], "0.02world"),
+        (vec!["--emission", "heat"], "no grid \"heat\"; it has density"),
         (vec!["--size", "0x4"], "1920x1080"),
     ] {
         let (code, error) = failure(&render(&wrong));
         assert!(code == 2 && error.contains(part), "{wrong:?}: {code} {error}");
     }
+    let (code, error) = failure(&volpack(at, &["render", "a.volpack", "-o", "p.jpg"]));
+    assert!(code == 2 && error.contains(".png") && error.contains(".apng"), "{code} {error}");
 }
 
 #[test]

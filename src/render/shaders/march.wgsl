@@ -114,8 +114,8 @@ fn vp_sample_from(t: f32, step: f32, offset: f32) -> f32 {
     return ceil(t / step - offset);
 }
 
-// Samples are at t = (number + offset) · step. Each looks up its node anew: a second loop that kept a brick while the ray
-// is in it takes 1.6 to 2.6 times as long, because neighbouring rays then no longer sample together.
+// Samples are at t = (number + offset) · step. Each looks up its node anew: a second loop for the samples of one brick
+// does not help, because neighbouring rays then sample at different times.
 fn vp_march(fog: VpFog, ray: VpRay, offset: f32) -> VpMarched {
     var light = vec3f(0.0);
     var depth = 0.0;
