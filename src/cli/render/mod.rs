@@ -205,8 +205,10 @@ pub fn run(args: &RenderArgs, common: Common) -> Result<()> {
     if !common.quiet {
         let what = if frames.len() == 1 { "1 frame".to_owned() } else { format!("{} frames", frames.len()) };
         let steps = steps.iter().sum::<f64>() / frames.len() as f64;
+        // What --extinction can be set from.
+        let shown = extinction.map(|extinction| format!(", extinction {extinction:.3}")).unwrap_or_default();
         let title = style::TITLE;
-        outln!("{title}{}{title:#}: {what}, {steps:.1} steps a ray", args.output.display());
+        outln!("{title}{}{title:#}: {what}, {steps:.1} steps a ray{shown}", args.output.display());
     }
     Ok(())
 }
