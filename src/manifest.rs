@@ -10,7 +10,7 @@ use toml::de::{DeTable, DeValue};
 
 use crate::error::{Error, Result};
 use crate::file_name::check_path;
-use crate::settings::{Budget, Settings, SettingsArgs, check_above_zero};
+use crate::settings::{Budget, Look, Settings, SettingsArgs, check_above_zero};
 
 /// The manifest's name where none is given.
 pub const DEFAULT_NAME: &str = "pipeline.toml";
@@ -37,6 +37,8 @@ pub struct Asset {
     pub max_flip: Option<f64>,
     /// What it may cost and has to keep.
     pub budget: Budget,
+    /// How `volpack render` shows it.
+    pub look: Look,
 }
 
 #[derive(Deserialize)]
@@ -59,6 +61,8 @@ struct RawAsset {
     output: Option<PathBuf>,
     #[serde(default)]
     budget: Budget,
+    #[serde(default)]
+    look: Look,
 }
 
 #[derive(Deserialize)]
@@ -161,12 +165,14 @@ impl RawAsset {
         };
         let output = self.output.unwrap_or_else(|| PathBuf::from(format!("{name}.volpack")));
         check_path(&output).map_err(|e| format!("output: {e}"))?;
+        self.look.check().map_err(|e| format!("look: {e}"))?;
         Ok(Asset {
             frames: frames.into_iter().map(|f| folder.join(f)).collect(),
             output: folder.join(output),
             max_flip: self.max_flip,
             budget: all.of_asset(&self.budget),
             settings: settings.settings()?,
+            look: self.look,
         })
     }
 }

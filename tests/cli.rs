@@ -319,12 +319,26 @@ fn pictures_are_rendered_compared_and_kept() {
         (vec!["--frames", "20-24"], "no frame from 20 to 24; it has 1 to 8"),
         (vec!["--camera", "orbit:1"], "orbit:AZIMUTH"),
         (vec!["--step", "0"], "0.02world"),
+        (vec!["--albedo", "1.5"], "albedo is a number from 0 to 1"),
         (vec!["--emission", "heat"], "no grid \"heat\"; it has density"),
         (vec!["--size", "0x4"], "1920x1080"),
     ] {
         let (code, error) = failure(&render(&wrong));
         assert!(code == 2 && error.contains(part), "{wrong:?}: {code} {error}");
     }
+    // A manifest's look is that of the same options, and the command line goes before it.
+    let manifest =
+        "[asset.a]\nframes = 'a.vdb'\n[asset.a.look]\nsun = [20, 30]\nalbedo = 0.5\ncamera = 'orbit:0,0'\n";
+    std::fs::write(at.join("pipeline.toml"), manifest).unwrap();
+    let drawn = |args: &[&str]| {
+        let always = ["render", "-o", "p.png", "--size", "48x32", "--device", "cpu"];
+        stdout(&volpack(at, &[&always[..], args].concat()));
+        std::fs::read(at.join("p.png")).unwrap()
+    };
+    let by_options = ["a.volpack", "--sun", "20,30", "--albedo", "0.9", "--camera", "orbit:0,0"];
+    assert_eq!(drawn(&["--asset", "a", "--albedo", "0.9"]), drawn(&by_options));
+    assert_ne!(drawn(&["--asset", "a"]), drawn(&by_options));
+
     let (code, error) = failure(&volpack(at, &["render", "a.volpack", "-o", "p.jpg"]));
     assert!(code == 2 && error.contains(".png") && error.contains(".apng"), "{code} {error}");
 }

@@ -1,9 +1,8 @@
 //! Where pictures are taken from.
 
-use clap::ValueEnum;
-
 use super::traverse::{Ray, Real};
 use crate::pack::Grid;
+use crate::settings::{Up, View};
 use crate::volume::CoordBox;
 
 /// A box in world space, parallel to its axes.
@@ -55,17 +54,6 @@ impl WorldBox {
     }
 }
 
-/// The axis of world space that points up.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-pub enum Up {
-    /// x
-    X,
-    /// y, as in Houdini
-    Y,
-    /// z, as in Blender
-    Z,
-}
-
 impl Up {
     /// A guess from the shape, because a pack does not contain the axis. Smoke, clouds and explosions are about as wide as
     /// they are deep, so up is the one of y and z around which the box is closer to a square; y if both are equal.
@@ -100,68 +88,11 @@ pub struct Camera {
     pub up: Up,
 }
 
-/// How a camera is asked for.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum View {
-    /// Around the middle of the volume's box.
-    Orbit {
-        /// In degrees: 0 is in front, 90 to the right.
-        azimuth: f64,
-        /// In degrees: 90 is above.
-        elevation: f64,
-        /// In diagonals of the box; without one as near as shows all of the box.
-        distance: Option<f64>,
-    },
-    /// A camera in world space: the eye, what it looks at, and the vertical angle of view in degrees.
-    Fixed {
-        /// See [`Camera::eye`].
-        eye: [f64; 3],
-        /// See [`Camera::target`].
-        target: [f64; 3],
-        /// See [`Camera::fov`].
-        fov: f64,
-    },
-}
-
 impl Default for View {
     /// From ahead, above and to the side, one and a quarter diagonals away, with all of the box in
     /// view.
     fn default() -> Self {
         Self::Orbit { azimuth: 40.0, elevation: 20.0, distance: Some(1.25) }
-    }
-}
-
-/// A view that cannot be parsed.
-#[derive(Debug, thiserror::Error)]
-#[error(
-    "{0:?} is not a camera: orbit:AZIMUTH,ELEVATION[,DISTANCE] or X,Y,Z;X,Y,Z;FOV (eye; target; degrees)"
-)]
-pub struct CameraError(String);
-
-impl std::str::FromStr for View {
-    type Err = CameraError;
-
-    fn from_str(text: &str) -> Result<Self, CameraError> {
-        let error = || CameraError(text.to_owned());
-        let numbers = |text: &str| -> Option<Vec<f64>> {
-            let numbers: Vec<f64> = text.split(',').map(|v| v.trim().parse().ok()).collect::<Option<_>>()?;
-            numbers.iter().all(|v| v.is_finite()).then_some(numbers)
-        };
-        if let Some(orbit) = text.strip_prefix("orbit:") {
-            return match numbers(orbit).as_deref() {
-                Some(&[azimuth, elevation]) => Ok(Self::Orbit { azimuth, elevation, distance: None }),
-                Some(&[azimuth, elevation, distance]) if distance > 0.0 => {
-                    Ok(Self::Orbit { azimuth, elevation, distance: Some(distance) })
-                }
-                _ => Err(error()),
-            };
-        }
-        let place = |text: &str| -> Option<[f64; 3]> { numbers(text)?.try_into().ok() };
-        let parts: Vec<&str> = text.split(';').collect();
-        let [eye, target, fov] = parts[..] else { return Err(error()) };
-        let fov = fov.trim().parse().ok().filter(|f| (1.0..170.0).contains(f)).ok_or_else(error)?;
-        let (eye, target) = place(eye).zip(place(target)).filter(|(e, t)| e != t).ok_or_else(error)?;
-        Ok(View::Fixed { eye, target, fov })
     }
 }
 
@@ -324,26 +255,6 @@ pub fn normalise(v: [f64; 3]) -> [f64; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn views_are_parsed() {
-        let orbit = |distance| View::Orbit { azimuth: 10.0, elevation: 20.0, distance };
-        assert_eq!("orbit:10,20,1.5".parse::<View>().unwrap(), orbit(Some(1.5)));
-        assert_eq!("orbit:10,20".parse::<View>().unwrap(), orbit(None));
-        let fixed = View::Fixed { eye: [1.0, 2.0, 3.0], target: [0.0; 3], fov: 45.0 };
-        assert_eq!("1,2,3;0,0,0;45".parse::<View>().unwrap(), fixed);
-        for bad in [
-            "",
-            "orbit:1",
-            "orbit:1,2,0",
-            "orbit:1,2,3,4",
-            "1,2,3;1,2,3;45",
-            "1,2,3;0,0,0;0",
-            "1,2,x;0,0,0;45",
-        ] {
-            assert!(bad.parse::<View>().is_err(), "{bad}");
-        }
-    }
 
     #[test]
     fn the_middle_ray_meets_the_target() {

@@ -1,6 +1,7 @@
 //! The lights of a fog picture.
 
-use super::camera::{Up, direction};
+use super::camera::direction;
+use crate::settings::Up;
 
 /// The lights, and how fog scatters them.
 #[derive(Clone, Copy, Debug, PartialEq)]

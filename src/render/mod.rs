@@ -26,18 +26,19 @@ mod scene;
 mod surface;
 mod traverse;
 
-pub use camera::{Camera, CameraError, Lens, Up, View, WorldBox};
+pub use camera::{Camera, Lens, WorldBox};
 pub use cpu::{Medium, body_extinction, optical_depths, spread, trace, trace_noting_gpu_spread};
 pub use decoded_frame::DecodedFrame;
 pub use image::{Difference, Image, apart, difference, write_apng, write_png};
 pub use light::{Light, SOOTY_ALBEDO};
 pub use renderer::{Device, Renderer};
-pub use scene::{Emission, March, Scene, Step, TraceError};
+pub use scene::{Emission, March, Scene, TraceError};
 pub use traverse::{Box3, Ray, Real, Walk};
 
 use clap::ValueEnum;
 
 use crate::pack::Grid;
+pub use crate::settings::{Step, Up, View};
 
 /// What a picture shows.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]

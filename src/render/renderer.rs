@@ -4,13 +4,13 @@ use clap::ValueEnum;
 use serde::Serialize;
 
 use super::Mode;
-use super::camera::View;
 use super::cpu::{Medium, body_extinction, trace};
 use super::decoded_frame::DecodedFrame;
 use super::gpu::{Gpu, GpuError, Uploaded};
 use super::image::Image;
 use super::scene::Scene;
 use crate::pack::{FrameReader, Pack};
+use crate::settings::View;
 
 /// What traces a picture.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, ValueEnum)]

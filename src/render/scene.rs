@@ -1,11 +1,12 @@
 //! What a picture shows and how, and what follows from it for all pixels: the input of both tracers.
 
 use super::black_body::black_body;
-use super::camera::{Camera, Lens, Up, View, WorldBox, apply3, dot, invert3, length, normalise};
+use super::camera::{Camera, Lens, WorldBox, apply3, dot, invert3, length, normalise};
 use super::light::Light;
 use super::traverse::{Box3, MAX_CELL};
 use super::{Interpolation, Mode, Traversal};
 use crate::pack::Grid;
+use crate::settings::{Step, Up, View};
 use crate::volume::CoordBox;
 
 /// What a picture shows, from where, and how it looks.
@@ -35,15 +36,6 @@ pub struct Scene {
     pub extinction: f64,
     /// Densities above this are a hit.
     pub threshold: f32,
-}
-
-/// The step of a ray march.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Step {
-    /// In voxels.
-    Voxels(f64),
-    /// In world units.
-    World(f64),
 }
 
 /// How fog is ray-marched.

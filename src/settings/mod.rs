@@ -5,6 +5,7 @@ mod budget;
 mod clustering;
 mod document;
 mod encoding;
+mod look;
 mod quality;
 
 use clap::ValueEnum;
@@ -15,6 +16,7 @@ pub use args::SettingsArgs;
 pub use budget::{Budget, Share};
 pub use clustering::{Clustering, Dedup};
 pub use encoding::{Encoding, Format};
+pub use look::{Look, Step, Sun, Up, View, ViewError};
 pub(crate) use quality::check_above_zero;
 pub use quality::{ByteSize, ErrorBound, FRAME_MARGIN_DB, Quality, above_zero, whole_range};
 

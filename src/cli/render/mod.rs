@@ -16,18 +16,27 @@ use super::progress::Reporter;
 use super::{Common, outln, style};
 use crate::atomic_file;
 use crate::error::{Error, Result};
+use crate::manifest::{DEFAULT_NAME, Manifest};
 use crate::pack::{Frame, Grid, Pack};
 use crate::progress::Progress;
 use crate::render::gpu::GpuError;
 use crate::render::{
-    Device, Emission, Interpolation, Light, March, Mode, Renderer, SOOTY_ALBEDO, Scene, Step, Traversal, Up,
-    View, WorldBox, write_apng, write_png,
+    Device, Emission, Interpolation, Light, March, Mode, Renderer, SOOTY_ALBEDO, Scene, Traversal, View,
+    WorldBox, write_apng, write_png,
 };
+use crate::settings::Look;
 
 #[derive(Args)]
 pub struct RenderArgs {
     /// Pack to render
-    pack: PathBuf,
+    #[arg(required_unless_present = "asset", conflicts_with = "asset")]
+    pack: Option<PathBuf>,
+    /// Asset of the manifest to render, with the look that the manifest gives it
+    #[arg(long, value_name = "NAME")]
+    asset: Option<String>,
+    /// Manifest that has the asset
+    #[arg(short, long, value_name = "FILE", default_value = DEFAULT_NAME, requires = "asset")]
+    manifest: PathBuf,
     /// Picture to write: .png, or .apng for an animation
     #[arg(short, long, value_name = "OUT.png", value_parser = super::output_path())]
     output: PathBuf,
@@ -46,12 +55,6 @@ pub struct RenderArgs {
     /// Size of a frame in pixels
     #[arg(long, value_name = "WxH", default_value = "512x512", value_parser = size)]
     size: [u32; 2],
-    /// Camera: orbit:AZIMUTH,ELEVATION[,DISTANCE] in degrees and box diagonals, or "X,Y,Z;X,Y,Z;FOV" (eye; target; degrees)
-    #[arg(long, value_name = "VIEW", default_value = "orbit:40,20")]
-    camera: View,
-    /// Axis that points up [default: guessed from the shape]
-    #[arg(long, value_name = "AXIS")]
-    up: Option<Up>,
     /// Device that renders
     #[arg(long, default_value = "auto")]
     device: Device,
@@ -62,74 +65,7 @@ pub struct RenderArgs {
     #[arg(long, default_value = "trilinear")]
     interpolation: Interpolation,
     #[command(flatten)]
-    fog: FogArgs,
-}
-
-/// How fog is sampled and lit.
-#[derive(Args)]
-#[command(next_help_heading = "Fog")]
-struct FogArgs {
-    /// Step of the ray march: 0.5 is in voxels, 0.02world in world units
-    #[arg(long, value_name = "STEP", default_value = "0.5", value_parser = step)]
-    step: Step,
-    /// Offset each pixel's samples by a hash, which turns banding into noise
-    #[arg(long)]
-    jitter: bool,
-    /// Extinction: optical depth per world unit at density 1 [default: with --mode lit, half of the covered pixels have an optical depth above 3; otherwise, the highest density has 24 across the box]
-    #[arg(long, value_name = "X", value_parser = super::above_zero)]
-    extinction: Option<f64>,
-    /// Direction of the sun in degrees [default: 110,40]
-    #[arg(long, value_name = "AZIMUTH,ELEVATION", allow_hyphen_values = true, value_parser = sun)]
-    sun: Option<[f64; 2]>,
-    /// Scattering albedo, 0 to 1 [default: 0.95; 0.6 with an emissive grid]
-    #[arg(long, value_name = "PART", value_parser = part)]
-    albedo: Option<f64>,
-    /// Anisotropy of scattering (g of Henyey and Greenstein): -0.99 backward, 0 isotropic, 0.99 forward
-    #[arg(long, value_name = "G", default_value_t = Light::default().anisotropy, allow_negative_numbers = true, value_parser = anisotropy)]
-    anisotropy: f64,
-    /// Ambient light from the sky, as a factor
-    #[arg(long, value_name = "X", default_value_t = Light::default().ambient, value_parser = not_below_zero)]
-    ambient: f64,
-    /// Emissive grid, or none [default: flame or temperature, if the pack has it]
-    #[arg(long, value_name = "GRID")]
-    emission: Option<String>,
-    /// Brightness of the emission, as a factor
-    #[arg(long, value_name = "X", default_value_t = 1.0, value_parser = not_below_zero)]
-    emission_strength: f64,
-    /// Temperature at value 1 of the emissive grid, in kelvin [default: 1 if the grid has values above 100; otherwise, its highest value is 1900 K]
-    #[arg(long, value_name = "K", value_parser = super::above_zero)]
-    kelvin: Option<f64>,
-}
-
-fn number(text: &str, is_allowed: impl Fn(f64) -> bool, what: &str) -> std::result::Result<f64, String> {
-    text.trim().parse().ok().filter(|v: &f64| v.is_finite() && is_allowed(*v)).ok_or_else(|| what.to_owned())
-}
-
-fn part(text: &str) -> std::result::Result<f64, String> {
-    number(text, |v| (0.0..=1.0).contains(&v), "a number from 0 to 1")
-}
-
-fn not_below_zero(text: &str) -> std::result::Result<f64, String> {
-    number(text, |v| v >= 0.0, "a number of 0 or more")
-}
-
-fn anisotropy(text: &str) -> std::result::Result<f64, String> {
-    number(text, |v| v.abs() <= 0.99, "a number from -0.99 to 0.99")
-}
-
-fn step(text: &str) -> std::result::Result<Step, String> {
-    let what = "a number above 0, such as 0.5 (voxels) or 0.02world (world units)";
-    let (text, step): (_, fn(f64) -> Step) = match text.strip_suffix("world") {
-        Some(text) => (text, Step::World),
-        None => (text, Step::Voxels),
-    };
-    number(text, |v| v > 0.0, what).map(step)
-}
-
-fn sun(text: &str) -> std::result::Result<[f64; 2], String> {
-    let what = "an azimuth and an elevation in degrees, such as 75,45";
-    let (azimuth, elevation) = text.split_once(',').ok_or(what)?;
-    Ok([number(azimuth, |_| true, what)?, number(elevation, |v| v.abs() <= 90.0, what)?])
+    look: Look,
 }
 
 /// The largest picture side: a terabyte of pixels is a slip of the finger.
@@ -163,25 +99,44 @@ impl FileType {
     }
 }
 
+/// The camera where none is asked for: from ahead, above and to the side.
+const VIEW: View = View::Orbit { azimuth: 40.0, elevation: 20.0, distance: None };
+
+/// The pack, and how it is to look: as the command line says, and where that is silent as the manifest says.
+fn subject(args: &RenderArgs) -> Result<(PathBuf, Look)> {
+    let look = args.look.clone();
+    match (&args.pack, &args.asset) {
+        (Some(pack), _) => Ok((pack.clone(), look)),
+        (None, name) => {
+            let manifest = Manifest::read(&args.manifest)?;
+            let asset = manifest.asset(name.as_deref().unwrap_or_default())?;
+            Ok((asset.output.clone(), look.or(&asset.look)))
+        }
+    }
+}
+
 pub fn run(args: &RenderArgs, common: Common) -> Result<()> {
     let file_type = FileType::of(&args.output)?;
-    let pack = Pack::open(&args.pack).map_err(Error::pack(&args.pack))?;
-    if args.output.canonicalize().is_ok_and(|o| args.pack.canonicalize().is_ok_and(|p| o == p)) {
+    let (path, look) = subject(args)?;
+    look.check().map_err(Error::Usage)?;
+    let view = look.camera.unwrap_or(VIEW);
+    let pack = Pack::open(&path).map_err(Error::pack(&path))?;
+    if args.output.canonicalize().is_ok_and(|o| path.canonicalize().is_ok_and(|p| o == p)) {
         return Err(Error::Usage(format!("{} is the pack and the picture too", args.output.display())));
     }
-    let wrong = |what: String| Error::Usage(format!("{}: {what}", args.pack.display()));
+    let wrong = |what: String| Error::Usage(format!("{}: {what}", path.display()));
     let grid = args.grid.as_deref().map_or(Ok(0), |name| named(pack.grids(), name)).map_err(wrong)?;
     let frames = frames(args, &pack.grids()[grid].frames).map_err(wrong)?;
-    let emissive = emissive(args, pack.grids(), grid).map_err(wrong)?;
-    let renderer = Renderer::fastest(&pack, args.device).map_err(|e| gpu_error(e, &args.pack))?;
+    let emissive = emissive(args.mode, &look, pack.grids(), grid).map_err(wrong)?;
+    let renderer = Renderer::fastest(&pack, args.device).map_err(|e| gpu_error(e, &path))?;
     if !common.quiet {
         let why = renderer.fallback.as_ref().map(|why| format!(" ({why})")).unwrap_or_default();
         anstream::eprintln!("tracing with {}{why}", renderer.device_name());
     }
 
-    let extinction = match args.fog.extinction {
+    let extinction = match look.extinction {
         None if args.mode == Mode::Lit && !pack.grids()[grid].is_level_set() => {
-            renderer.body_extinction(grid, &args.camera).map_err(|e| gpu_error(e, &args.pack))?
+            renderer.body_extinction(grid, &view).map_err(|e| gpu_error(e, &path))?
         }
         asked => asked,
     };
@@ -191,9 +146,9 @@ pub fn run(args: &RenderArgs, common: Common) -> Result<()> {
         say(&|reporter| reporter.stage("rendering", frames.len() as u64, "frames"));
     }
     let draw = |&frame: &usize| -> Result<(Picture, f64)> {
-        let scene = scene(args, pack.grids(), [grid, frame], emissive);
+        let scene = scene(args, &look, pack.grids(), [grid, frame], emissive);
         let scene = Scene { extinction: extinction.unwrap_or(scene.extinction), ..scene };
-        let image = renderer.render(grid, frame, &scene).map_err(|e| gpu_error(e, &args.pack))?;
+        let image = renderer.render(grid, frame, &scene).map_err(|e| gpu_error(e, &path))?;
         say(&|reporter| reporter.advance(1));
         let number = pack.grids()[grid].frames[frame].record.number;
         Ok((Picture { number, rgb: image.to_rgb8(&scene) }, image.mean_steps()))
@@ -234,11 +189,16 @@ fn frames(args: &RenderArgs, all: &[Frame]) -> std::result::Result<Vec<usize>, S
 const EMISSIVE: [&str; 7] = ["flame", "flames", "fire", "burn", "temperature", "temp", "heat"];
 
 /// The emissive grid of lit fog.
-fn emissive(args: &RenderArgs, grids: &[Grid], shown: usize) -> std::result::Result<Option<usize>, String> {
-    if args.mode != Mode::Lit || grids[shown].is_level_set() {
+fn emissive(
+    mode: Mode,
+    look: &Look,
+    grids: &[Grid],
+    shown: usize,
+) -> std::result::Result<Option<usize>, String> {
+    if mode != Mode::Lit || grids[shown].is_level_set() {
         return Ok(None);
     }
-    match args.fog.emission.as_deref() {
+    match look.emission.as_deref() {
         Some("none") => Ok(None),
         Some(name) => named(grids, name).map(Some),
         None => Ok(EMISSIVE
@@ -252,28 +212,36 @@ fn emissive(args: &RenderArgs, grids: &[Grid], shown: usize) -> std::result::Res
     }
 }
 
-fn scene(args: &RenderArgs, grids: &[Grid], [grid, frame]: [usize; 2], emissive: Option<usize>) -> Scene {
-    let usual = Scene::new(&grids[grid], frame, &args.camera, args.mode, args.size);
-    let fog = &args.fog;
+fn scene(
+    args: &RenderArgs,
+    look: &Look,
+    grids: &[Grid],
+    [grid, frame]: [usize; 2],
+    emissive: Option<usize>,
+) -> Scene {
+    let view = look.camera.unwrap_or(VIEW);
+    let usual = Scene::new(&grids[grid], frame, &view, args.mode, args.size);
     let number = grids[grid].frames[frame].record.number;
     let emission = emissive.and_then(|other| {
         let frame = grids[other].frames.iter().position(|frame| frame.record.number == number)?;
-        Some(Emission::new(grids, other, frame, fog.kelvin, fog.emission_strength))
+        let strength = look.emission_strength.unwrap_or(1.0);
+        Some(Emission::new(grids, other, frame, look.kelvin, strength))
     });
-    let usual_albedo = if emission.is_some() { SOOTY_ALBEDO } else { Light::default().albedo };
+    let light = Light::default();
+    let usual_albedo = if emission.is_some() { SOOTY_ALBEDO } else { light.albedo };
     Scene {
-        camera: match args.up {
-            Some(up) => args.camera.camera(&WorldBox::of_grid(&grids[grid]), up, args.size),
+        camera: match look.up {
+            Some(up) => view.camera(&WorldBox::of_grid(&grids[grid]), up, args.size),
             None => usual.camera,
         },
         traversal: args.traversal,
         interpolation: args.interpolation,
-        march: March { step: fog.step, jitter: fog.jitter },
+        march: March { step: look.step.unwrap_or(usual.march.step), jitter: look.jitter },
         light: Light {
-            sun: fog.sun.unwrap_or(Light::default().sun),
-            albedo: fog.albedo.unwrap_or(usual_albedo),
-            anisotropy: fog.anisotropy,
-            ambient: fog.ambient,
+            sun: look.sun.map_or(light.sun, |sun| sun.0),
+            albedo: look.albedo.unwrap_or(usual_albedo),
+            anisotropy: look.anisotropy.unwrap_or(light.anisotropy),
+            ambient: look.ambient.unwrap_or(light.ambient),
         },
         emission,
         ..usual
