@@ -520,7 +520,7 @@ fn a_watch_builds_what_lands_and_ctrl_c_ends_it() {
     wait_until("an error", || said("kept the last good pack"));
     assert!(fs::read(shop.path("puff.volpack")).unwrap() == good);
 
-    // On Windows only the console can send Ctrl-C, and to all of its programs at once.
+    // Windows sends Ctrl-C to all programs of a console at once, and so to the tests too.
     if cfg!(unix) {
         // The shell's own: a program of that name is not on every machine.
         let kill = format!("kill -INT {}", child.0.id());
