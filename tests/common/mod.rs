@@ -4,6 +4,8 @@
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::process::Child;
+use std::time::{Duration, Instant};
 
 use serde_json::Value as Json;
 use volpack::pack::Pack;
@@ -71,4 +73,27 @@ pub fn build_verified(frames: &[PathBuf], settings: Settings, folder: &Path) -> 
     let job = Job::new(frames.to_vec(), output, settings, VerifyLevel::Voxels);
     let outcome = build(&job, &mut Silent).unwrap_or_else(|e| panic!("{frames:?}: {e}"));
     (Pack::open(&job.output).unwrap(), outcome.verification.unwrap())
+}
+
+/// Waits until a condition holds.
+///
+/// # Panics
+/// When it does not within two minutes, which is enough for a busy machine.
+pub fn wait_until(what: &str, holds: impl Fn() -> bool) {
+    let end = Instant::now() + Duration::from_secs(120);
+    while !holds() {
+        assert!(Instant::now() < end, "waited for {what} in vain");
+        std::thread::sleep(Duration::from_millis(100));
+    }
+}
+
+/// A process that does not outlive a test that fails.
+pub struct EndedWithTheTest(pub Child);
+
+impl Drop for EndedWithTheTest {
+    fn drop(&mut self) {
+        // It may have ended by itself.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
 }

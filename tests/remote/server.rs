@@ -58,6 +58,8 @@ pub struct Gate {
     writes: AtomicU64,
     /// Bytes of answers.
     sent: AtomicU64,
+    /// Held by a request until its answer is sent, on Windows.
+    turn: Arc<tokio::sync::Mutex<()>>,
 }
 
 impl Gate {
@@ -106,6 +108,8 @@ impl Gate {
             }
             _ => {}
         }
+        // s3s-fs replaces an object's file while other requests read it, which wine refuses.
+        let turn = if cfg!(windows) { Some(self.turn.clone().lock_owned().await) } else { None };
         let (head, body) = s3
             .call(request.map(s3s::Body::from))
             .await
@@ -135,6 +139,7 @@ impl Gate {
             _ => TryStreamExt::map_err(body, io::Error::other).boxed(),
         };
         let counted = body.inspect_ok(move |bytes: &Bytes| {
+            let _held = &turn;
             self.sent.fetch_add(bytes.len() as u64, SeqCst);
         });
         let body = s3s::Body::http_body_unsync(StreamBody::new(counted.map_ok(Frame::data)));
@@ -163,6 +168,7 @@ impl Server {
             requests: AtomicU64::new(0),
             writes: AtomicU64::new(0),
             sent: AtomicU64::new(0),
+            turn: Arc::default(),
         });
         let runtime = Runtime::new().unwrap();
         let listener = runtime.block_on(TcpListener::bind("127.0.0.1:0")).unwrap();

@@ -27,6 +27,7 @@ mod trace;
 mod wasm;
 mod windows;
 mod wine;
+mod wine_prefix;
 
 use std::error::Error;
 use std::path::{Path, PathBuf};

@@ -10,10 +10,16 @@ use serde_json::Value as Json;
 
 use crate::peer_programs;
 use crate::wine;
+use crate::wine_prefix::Prefix;
 
 type Result<T> = std::result::Result<T, Box<dyn Error>>;
 
 pub const TARGET: &str = "x86_64-pc-windows-gnu";
+
+/// Arguments of `cargo test`. The examples in the documentation are not among them, because cargo does not pass the linker
+/// arguments of `build.rs` on to those.
+const ALL_TESTS: [&str; 5] =
+    ["--release", "--no-fail-fast", "--package=volpack", "--package=volpack-format", "--tests"];
 
 #[derive(clap::Args)]
 pub struct Args {
@@ -23,8 +29,9 @@ pub struct Args {
     /// Path of the Linux program to compare with
     #[arg(long, default_value = "target/release/volpack", requires = "wine")]
     volpack: PathBuf,
-    /// Run `cargo test` under wine instead, with these arguments, for example `--lib`
-    #[arg(long, num_args = 1.., allow_hyphen_values = true, value_name = "ARGUMENT", conflicts_with = "wine")]
+    /// Run tests under wine instead: all of them, or those that these arguments of `cargo test` choose, for example
+    /// `--release --lib`
+    #[arg(long, num_args = 0.., allow_hyphen_values = true, value_name = "ARGUMENT", conflicts_with = "wine")]
     test: Option<Vec<OsString>>,
 }
 
@@ -32,9 +39,14 @@ pub fn run(args: &Args) -> Result<()> {
     let toolchain = Toolchain::find()?;
     let libraries = collect_libraries(&toolchain)?;
     if let Some(arguments) = &args.test {
-        let prefix = wine::Prefix::new(&toolchain.cc)?;
+        let prefix = Prefix::new(&toolchain.cc)?;
         let mut cargo = toolchain.cargo(&libraries);
-        cargo.arg("test").args(["--target", TARGET]).args(arguments);
+        cargo.arg("test").args(["--target", TARGET]);
+        if arguments.is_empty() {
+            cargo.args(ALL_TESTS);
+        } else {
+            cargo.args(arguments);
+        }
         cargo.env("CARGO_TARGET_X86_64_PC_WINDOWS_GNU_RUNNER", prefix.program());
         prefix.set_environment(&mut cargo);
         return succeed(&mut cargo);
