@@ -384,7 +384,7 @@ fn a_slip_in_the_arguments_costs_no_file() {
     assert!(report["assets"][0]["error"].as_str().unwrap().contains("flipped"));
 
     let (code, error) = failure(&volpack(at, &["render", "a.volpack", "-o", "a.volpack", "--device", "cpu"]));
-    assert!(code == 2 && error.contains("the picture too"), "{code} {error}");
+    assert!(code == 2 && error.contains("written as .png"), "{code} {error}");
 
     for (manifest, args, expected, part) in [
         ("[asset.a]\nframes = []\n", vec!["build"], 3, "no frames"),

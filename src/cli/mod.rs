@@ -83,7 +83,7 @@ enum Command {
     /// Verify a pack against its source
     Verify(verify::VerifyArgs),
     /// Render pictures of a pack
-    Render(render::RenderArgs),
+    Render(Box<render::RenderArgs>),
     /// Report sizes, quality and budgets as HTML, JSON, Markdown or JUnit XML
     Report(Box<report::ReportArgs>),
     /// Measure many settings of a volume and chart quality against size and speed

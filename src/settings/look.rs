@@ -9,7 +9,7 @@ use serde::{Deserialize, Deserializer};
 #[derive(Args, Clone, Debug, Default, PartialEq, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Look {
-    /// Camera: orbit:AZIMUTH,ELEVATION[,DISTANCE] in degrees and box diagonals, or "X,Y,Z;X,Y,Z;FOV" (eye; target; degrees) [default: orbit:40,20]
+    /// Camera: orbit:AZIMUTH,ELEVATION or orbit:AZIMUTH,ELEVATION,DISTANCE in degrees and box diagonals, or "X,Y,Z;X,Y,Z;FOV" (eye; target; degrees) [default: orbit:40,20]
     #[arg(long, value_name = "VIEW")]
     pub camera: Option<View>,
     /// Axis that points up [default: guessed from the shape]

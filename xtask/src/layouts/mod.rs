@@ -80,7 +80,7 @@ struct Entry {
 
 enum Maker {
     Shader(Kernel),
-    Tracer(Traced),
+    Tracer(Box<Traced>),
     NanoVdb(March),
 }
 

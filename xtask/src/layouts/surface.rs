@@ -139,7 +139,7 @@ pub fn rows(
         let bricks = Choices::of(&pack, &Voxels::of(&pack)?).with_texels();
         let errors = errors(&picture, &reference);
         rows.push(row("fetched corners, as today", "tree", coding, bricks, Bytes::of(&pack), errors));
-        makers.push(Maker::Tracer(traced));
+        makers.push(Maker::Tracer(Box::new(traced)));
     }
     let shape = SHAPES[0];
     let cut = bricks::cut(&source.voxels, shape);
