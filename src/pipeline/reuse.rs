@@ -19,9 +19,9 @@ use crate::verify::VerifyReport;
 const PACK: Namespace = Namespace { name: "pack", version: 1, travels: true };
 /// A pack whose level of zstd is not what was asked for, but all else is.
 const ANY_LEVEL: Namespace = Namespace { name: "pack-any-zstd", version: 1, travels: true };
-const VERIFY: Namespace = Namespace { name: "verify", version: 4, travels: true };
+const VERIFY: Namespace = Namespace { name: "verify", version: 5, travels: true };
 /// A verification whose pictures were traced by the CPU alone, since no device could.
-const VERIFY_ON_CPU: Namespace = Namespace { name: "verify-on-cpu", version: 2, travels: true };
+const VERIFY_ON_CPU: Namespace = Namespace { name: "verify-on-cpu", version: 3, travels: true };
 
 impl KnownDigests for Cache {
     fn remembered(&self, path: &Path, stamp: &Stamp) -> Option<blake3::Hash> {

@@ -13,6 +13,7 @@ mod black_body;
 mod camera;
 mod cpu;
 mod decoded_frame;
+mod extinction;
 #[cfg(feature = "gpu")]
 pub mod gpu;
 #[cfg(not(feature = "gpu"))]
@@ -27,8 +28,9 @@ mod surface;
 mod traverse;
 
 pub use camera::{Camera, Lens, WorldBox};
-pub use cpu::{Medium, body_extinction, optical_depths, spread, trace, trace_noting_gpu_spread};
+pub use cpu::{Medium, optical_depths, spread, trace, trace_noting_gpu_spread};
 pub use decoded_frame::DecodedFrame;
+pub use extinction::body_extinction;
 pub use image::{Difference, Image, apart, difference, write_apng, write_png};
 pub use light::{Light, SOOTY_ALBEDO};
 pub use renderer::{Device, Renderer};

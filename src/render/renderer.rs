@@ -4,8 +4,9 @@ use clap::ValueEnum;
 use serde::Serialize;
 
 use super::Mode;
-use super::cpu::{Medium, body_extinction, trace};
+use super::cpu::{Medium, trace};
 use super::decoded_frame::DecodedFrame;
+use super::extinction::body_extinction;
 use super::gpu::{Gpu, GpuError, Uploaded};
 use super::image::Image;
 use super::scene::Scene;

@@ -18,7 +18,7 @@ const STRIP_FRAMES: usize = 24;
 const STRIP_SIDE: u32 = 96;
 
 /// Pictures are drawn once for a pack.
-const STAGE: Namespace = Namespace { name: "gallery", version: 2, travels: true };
+const STAGE: Namespace = Namespace { name: "gallery", version: 3, travels: true };
 
 /// A pack's pictures.
 #[derive(Clone, Debug, Serialize, Deserialize)]

@@ -55,7 +55,7 @@ pub struct RenderArgs {
     /// Size of a frame in pixels
     #[arg(long, value_name = "WxH", default_value = "512x512", value_parser = size)]
     size: [u32; 2],
-    /// Device that renders
+    /// Device that renders; auto takes a GPU if there is one, else the CPU, which is faster than software Vulkan
     #[arg(long, default_value = "auto")]
     device: Device,
     /// How rays step through the tree

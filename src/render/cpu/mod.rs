@@ -1,21 +1,22 @@
 //! The CPU tracer.
 //!
 //! In `f64` with [`Traversal::Dda`] it is the reference; in `f32` with [`Traversal::Hdda`] it is the
-//! shader's twin, line by line: this file of `shaders/tracer.wgsl`, `march.rs` of `shaders/march.wgsl`.
+//! shader's twin, line by line: this file and `shade.rs` of `shaders/tracer.wgsl`, `march.rs` of `shaders/march.wgsl`.
 
 mod march;
+mod shade;
 
 use rayon::prelude::*;
 
 use self::march::LightGrid;
-use super::camera::{dot, normalise};
+use super::camera::normalise;
 use super::decoded_frame::{Content, DecodedBrick, DecodedFrame, Nearby};
 use super::image::{Image, apart, opacity};
-use super::scene::{AMBIENT, Scene, Setup, TraceError};
+use super::scene::{Scene, Setup, TraceError};
 use super::surface::{cubic, evaluate, first_change};
 use super::traverse::{Box3, Ray, Real, Walk};
-use super::{Interpolation, Mode, Traversal};
-use crate::volume::{BRICK_DIM, Coord, L1_DIM, L2_DIM};
+use super::{Mode, Traversal};
+use crate::volume::{BRICK_DIM, Coord};
 
 /// Steps after which a ray is given up: more than any box in view has cells across.
 const MAX_STEPS: u32 = 1 << 16;
@@ -97,37 +98,6 @@ pub fn optical_depths<F: Real>(frame: &DecodedFrame, scene: &Scene) -> Result<Ve
         tracer.optical_depth(&ray, &mut Visited::default()).to_f64() as f32
     };
     Ok((0..width * height).into_par_iter().map(depth).collect())
-}
-
-/// Side of the picture whose median optical depth is taken, in pixels.
-const MEDIAN_SIDE: u32 = 64;
-/// Pixels below this fraction of the largest optical depth do not count as covered.
-const COVERED_PART: f32 = 0.01;
-/// Median optical depth of the covered pixels: 5 % of the light behind passes through.
-const BODY_DEPTH: f64 = 3.0;
-
-/// An extinction at which fog looks like a body with thin edges: the median optical depth of the covered pixels is 3. An
-/// extinction from the highest density alone would leave most smoke too thin, because few voxels are that dense. `None` if
-/// nothing is covered.
-///
-/// # Errors
-/// [`TraceError`].
-pub fn body_extinction(frame: &DecodedFrame, scene: &Scene) -> Result<Option<f64>, TraceError> {
-    let scene = Scene {
-        size: [MEDIAN_SIDE; 2],
-        mode: Mode::Density,
-        interpolation: Interpolation::Nearest,
-        ..*scene
-    };
-    let mut depths = optical_depths::<f32>(frame, &scene)?;
-    let thickest = depths.iter().copied().filter(|depth| depth.is_finite()).fold(0.0, f32::max);
-    depths.retain(|depth| depth.is_finite() && *depth > COVERED_PART * thickest);
-    if depths.is_empty() {
-        return Ok(None);
-    }
-    let middle = depths.len() / 2;
-    let (_, median, _) = depths.select_nth_unstable_by(middle, f32::total_cmp);
-    Ok(Some(BODY_DEPTH / f64::from(*median)))
 }
 
 /// What the rays of a pixel met.
@@ -407,69 +377,7 @@ impl<'a, F: Real> Tracer<'a, F> {
         let world = std::array::from_fn(|r| (0..3).map(|a| self.setup.normals[r][a] * gradient[a]).sum());
         Hit { t, cell: walk.cell, normal: Some(normalise(world)), axis: walk.axis, value: 1.0 }
     }
-
-    fn shade(&self, ray: &Ray<F>, hit: Option<Hit<F>>, visited: &mut Visited<'a>) -> [f32; 3] {
-        let Some(hit) = hit else {
-            return if self.scene.mode == Mode::Depth { [-1.0; 3] } else { [0.0; 3] };
-        };
-        match self.scene.mode {
-            Mode::Depth => [hit.t.to_f64() as f32; 3],
-            Mode::First => [hit.value; 3],
-            Mode::Bricks => brick_hue(self.voxel(hit.cell).0),
-            Mode::Nodes => self.node_color(ray, &hit),
-            Mode::Normals => self.normal(ray, &hit).map(|n| (n * 0.5 + 0.5) as f32),
-            Mode::Density | Mode::Lit => [self.lit(ray, &hit, visited) as f32; 3],
-            Mode::Steps => [0.0; 3],
-        }
-    }
-
-    /// A surface's own normal; else that of the face, in cell space.
-    fn normal(&self, ray: &Ray<F>, hit: &Hit<F>) -> [f64; 3] {
-        hit.normal.unwrap_or_else(|| {
-            let mut n = [0.0; 3];
-            if hit.axis < 3 {
-                n[hit.axis] = if ray.direction[hit.axis] > F::from_i32(0) { -1.0 } else { 1.0 };
-            }
-            n
-        })
-    }
-
-    fn lit(&self, ray: &Ray<F>, hit: &Hit<F>, visited: &mut Visited<'a>) -> f64 {
-        let normal = self.normal(ray, hit);
-        let facing = dot(normal, self.setup.sun_world);
-        if facing <= 0.0 {
-            return AMBIENT;
-        }
-        let sun = self.setup.sun.map(F::from_f64);
-        let origin = std::array::from_fn(|a| ray.origin[a] + ray.direction[a] * hit.t + sun[a]);
-        let shadow = Ray::new(origin, sun);
-        if self.first_hit(&shadow, visited).is_some() { AMBIENT } else { AMBIENT + (1.0 - AMBIENT) * facing }
-    }
-
-    /// Blue, red or cyan near a boundary of an L1, L2 or L3 node on the face that was hit; else grey.
-    fn node_color(&self, ray: &Ray<F>, hit: &Hit<F>) -> [f32; 3] {
-        // Nodes lie on multiples of their side counted from voxel 0.
-        let zero = self.setup.base.map(|b| -(b & (L1_DIM - 1)));
-        let p = self.local(ray, zero, hit.t);
-        for (dim, width, color) in NODE_COLORS {
-            let near = (0..3).filter(|&a| a != hit.axis).any(|a| {
-                let place = p[a] / F::from_i32(dim);
-                let nearest = (place + F::from_f64(0.5)).floor_i32();
-                let off = (place - F::from_i32(nearest)) * F::from_i32(dim);
-                let width = F::from_f64(width);
-                off < width && -off < width
-            });
-            if near {
-                return color;
-            }
-        }
-        [0.25; 3]
-    }
 }
-
-/// Side, half width of the line in cells, and colour of what is drawn around nodes.
-const NODE_COLORS: [(i32, f64, [f32; 3]); 3] =
-    [(L1_DIM, 1.0, [0.1, 0.2, 1.0]), (L2_DIM, 0.75, [1.0, 0.15, 0.1]), (BRICK_DIM, 0.5, [0.0, 0.9, 0.9])];
 
 /// The combinations of the four bits of a perturbation.
 const PERTURBATIONS: u32 = 16;
@@ -479,13 +387,4 @@ const PERTURBATIONS: u32 = 16;
 fn perturbation_sign(perturbation: u32, voxel: Coord) -> f32 {
     let odd = (0..3).filter(|&a| perturbation >> a & 1 == 1 && voxel.0[a] & 1 == 1).count();
     if (odd % 2 == 1) != (perturbation >> 3 == 1) { -1.0 } else { 1.0 }
-}
-
-/// A hue that differs between neighbouring bricks: the same bits in the shader.
-fn brick_hue(cell: [i32; 3]) -> [f32; 3] {
-    let [x, y, z] = cell.map(|c| (c >> 3) as u32);
-    let mut h = x.wrapping_mul(0x8da6_b343) ^ y.wrapping_mul(0xd816_3841) ^ z.wrapping_mul(0xcb1a_b31f);
-    h = (h ^ (h >> 13)).wrapping_mul(0x85eb_ca6b);
-    h ^= h >> 16;
-    [h & 255, h >> 8 & 255, h >> 16 & 255].map(|c| 0.2 + 0.8 * c as f32 / 255.0)
 }
