@@ -106,7 +106,8 @@ fn what_glows_adds_up_and_is_dimmed() {
     let field = decoded(&pack, [0, 0]);
     let half = f64::from(SIDE - 1) / 2.0 * VOXEL;
     let view = View::Fixed { eye: [half, half, 1000.0], target: [half; 3], fov: 0.01 };
-    let emission = Emission::new(pack.grids(), 0, 0, Some(1500.0 / 0.75), 1.0);
+    assert!(Emission::new(pack.grids(), 0, 0, Some(300.0 / 0.75), 1.0).is_none(), "air does not glow");
+    let emission = Emission::new(pack.grids(), 0, 0, Some(1500.0 / 0.75), 1.0).unwrap();
     let glow = emission.ramp.last().unwrap().map(f64::from);
     assert!(glow[0] > 0.0 && (glow[1] / glow[0] - 0.133).abs() < 0.02 && glow[2] == 0.0, "1,500 K is orange");
     let width = f64::from(SIDE) * VOXEL;
@@ -173,7 +174,7 @@ fn the_shader_lights_what_the_cpu_lights() {
         let frame = 6;
         let (field, heat) = (decoded(&pack, [0, frame]), decoded(&pack, [1, frame]));
         let usual = Scene::new(&pack.grids()[0], frame, &View::default(), Mode::Lit, SIZE);
-        let emission = Emission::new(pack.grids(), 1, frame, None, 1.0);
+        let emission = Emission::new(pack.grids(), 1, frame, None, 1.0).unwrap();
         for (what, scene) in [
             ("light", usual),
             ("glow", Scene { emission: Some(emission), ..usual }),

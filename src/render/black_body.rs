@@ -36,8 +36,8 @@ fn black_body_xyz(kelvin: f64) -> [f64; 3] {
     sum
 }
 
-/// The colour of a black body in linear sRGB (IEC 61966-2-1), its largest component 1. What sRGB cannot show is clipped:
-/// under 1,900 K that is a little blue less than none.
+/// The colour of a black body in linear sRGB (IEC 61966-2-1), its largest component 1. Below 1,900 K blue
+/// is slightly negative, and is set to 0. For temperatures that glow: the fit of the CIE functions is wrong in infrared.
 pub fn black_body(kelvin: f64) -> [f64; 3] {
     let [x, y, z] = black_body_xyz(kelvin);
     let rgb = [

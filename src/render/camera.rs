@@ -99,7 +99,7 @@ impl Default for View {
 /// The vertical angle of view of an orbit.
 const FOV: f64 = 45.0;
 
-/// How much of a picture's half the farthest corner of a fitted box leaves free.
+/// Free margin around a fitted box, as a fraction of half the picture.
 const MARGIN: f64 = 0.04;
 
 impl View {

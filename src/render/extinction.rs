@@ -1,4 +1,4 @@
-//! How dense lit fog is drawn where nobody says so.
+//! The default extinction of lit fog.
 
 use super::cpu::optical_depths;
 use super::decoded_frame::DecodedFrame;

@@ -31,8 +31,8 @@ impl Image {
                 Mode::Depth => [1.0 - 0.9 * (p[0] - nearest) / (largest - nearest).max(1e-30); 3],
                 Mode::Steps => heat(p[0] / largest),
                 Mode::First => [p[0] / largest; 3],
-                _ if p[..3] == [0.0; 3] => BACKDROP,
                 Mode::Lit if !scene.level_set => [p[0], p[1], p[2]].map(shoulder),
+                _ if p[..3] == [0.0; 3] => BACKDROP,
                 _ => [p[0], p[1], p[2]],
             }
         };

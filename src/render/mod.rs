@@ -90,7 +90,8 @@ impl Mode {
 /// How a grid is interpolated between voxels.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Interpolation {
-    /// The nearest voxel: fog is integrated exactly, voxel by voxel; a level set's surface is made of voxel faces
+    /// The nearest voxel: with --mode density, fog is integrated exactly, voxel by voxel; a level set's surface is made of
+    /// voxel faces
     Nearest,
     /// Trilinear, as games sample it: fog is ray-marched in equal steps, a level set's surface is smooth
     Trilinear,

@@ -16,7 +16,7 @@ use crate::settings::View;
 /// What traces a picture.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, ValueEnum)]
 pub enum Device {
-    /// A GPU or software Vulkan where one answers, else the CPU
+    /// A GPU if there is one, else software Vulkan or the CPU
     #[default]
     Auto,
     /// A GPU or software Vulkan
@@ -85,12 +85,13 @@ impl<'a> Renderer<'a> {
     ///
     /// # Errors
     /// When a chunk of the pack is damaged, or the frame cannot be traced.
-    pub fn body_extinction(&self, grid: usize, view: &View) -> Result<Option<f64>, GpuError> {
+    pub fn body_extinction(&self, grid: usize) -> Result<Option<f64>, GpuError> {
         let of = &self.pack.grids()[grid];
         let Some(frame) = (0..of.frames.len()).max_by_key(|&f| of.frames[f].record.active_voxels) else {
             return Ok(None);
         };
-        let scene = Scene::new(of, frame, view, Mode::Density, [1; 2]);
+        // One view for all pictures, so that fog is as dense from wherever it is seen.
+        let scene = Scene::new(of, frame, &View::default(), Mode::Density, [1; 2]);
         Ok(body_extinction(&DecodedFrame::from_pack(&self.pack.frame(grid, frame)?)?, &scene)?)
     }
 

@@ -7,7 +7,7 @@ use super::traverse::{Box3, MAX_CELL};
 use super::{Interpolation, Mode, Traversal};
 use crate::pack::Grid;
 use crate::settings::{Step, Up, View};
-use crate::volume::CoordBox;
+use crate::volume::{CoordBox, L2_DIM};
 
 /// What a picture shows, from where, and how it looks.
 #[derive(Clone, Copy, Debug)]
@@ -76,30 +76,44 @@ pub const RAMP_STEPS: usize = 64;
 const GLOW: f64 = 20.0;
 /// A grid whose values are all below this is not in kelvin.
 const LEAST_KELVIN: f32 = 100.0;
+/// The temperature below which nothing glows visibly (Draper, 1847).
+const DRAPER_POINT: f64 = 798.0;
 /// The temperature of the highest value of such a grid: a yellow flame.
 const FLAME_KELVIN: f64 = 1900.0;
 
 impl Emission {
     /// The emission of a grid of temperatures or flames: black bodies, whose radiance grows with the fourth power of their
     /// temperature (Stefan and Boltzmann). `kelvin` is the temperature at value 1. Without it, a grid with values above 100
-    /// is in kelvin, and the highest value of any other grid is a yellow flame.
+    /// is in kelvin, and the highest value of any other grid is a yellow flame. `None` if nothing is hot enough to glow.
     ///
     /// # Panics
     /// When there is no such frame.
-    pub fn new(grids: &[Grid], grid: usize, frame: usize, kelvin: Option<f64>, strength: f64) -> Self {
+    pub fn new(
+        grids: &[Grid],
+        grid: usize,
+        frame: usize,
+        kelvin: Option<f64>,
+        strength: f64,
+    ) -> Option<Self> {
         let of = &grids[grid];
         let hottest = of.record.active_max.max(f32::MIN_POSITIVE);
         let is_kelvin = hottest > LEAST_KELVIN;
         let per_value = if is_kelvin { 1.0 } else { FLAME_KELVIN / f64::from(hottest) };
         let kelvin = kelvin.unwrap_or(per_value) * f64::from(hottest);
+        if kelvin < DRAPER_POINT {
+            return None;
+        }
         let diagonal = WorldBox::of_grid(of).diagonal();
         let brightest = if diagonal > 0.0 { strength * GLOW / (0.1 * diagonal) } else { 0.0 };
         let ramp = std::array::from_fn(|i| {
             let part = i as f64 / (RAMP_STEPS - 1) as f64;
+            if part * kelvin < DRAPER_POINT {
+                return [0.0; 3];
+            }
             black_body(part * kelvin).map(|c| (c * brightest * part.powi(4)) as f32)
         });
         let matrix = of.frames[frame].record.transform;
-        Self { grid, frame, matrix, per_unit: 1.0 / f64::from(hottest), ramp }
+        Some(Self { grid, frame, matrix, per_unit: 1.0 / f64::from(hottest), ramp })
     }
 }
 
@@ -160,6 +174,13 @@ const SHADOW_OFFSET: f64 = 1.5;
 const LIGHT_SPACING: i32 = 2;
 /// Maximum number of points of the light grid: 2 MiB, and a second or two of one core.
 const MAX_LIGHT_POINTS: usize = 1 << 19;
+/// Maximum number of nodes that their rays cross. It makes the grid coarser in boxes of many thousand voxels.
+const MAX_LIGHT_STEPS: usize = 1 << 25;
+/// Nodes of fog that such a ray crosses, beside the empty nodes of 128 voxels of the box.
+const FOG_STEPS: usize = 32;
+/// Steps after which a ray is given up: more than any box in view has cells across.
+pub const MAX_STEPS: u32 = 1 << 16;
+
 /// Why a frame cannot be traced.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum TraceError {
@@ -169,6 +190,11 @@ pub enum TraceError {
     /// The box of what is not background is too wide for the tracers' arithmetic.
     #[error("its voxels lie in a box {0} voxels wide, and pictures are drawn of at most {MAX_CELL}")]
     TooWide(i64),
+    /// Rays would take more samples than a ray may.
+    #[error(
+        "the step of the ray march is too small: rays would take more than {MAX_STEPS} samples; use a larger --step"
+    )]
+    StepTooSmall,
 }
 
 /// What both tracers need and is the same for all pixels. Cells are counted from `base`, so that
@@ -236,10 +262,16 @@ impl Setup {
         let fog_sun = scene.light.to_sun(up);
         let row = |r: usize| std::array::from_fn(|c| scene.matrix[4 * r + c]);
         let (light_spacing, light_points) = light_grid(bounds);
+        let to_sun = apply3(&inverse, fog_sun);
         let (step, step_in_cells) = match scene.march.step {
             Step::Voxels(step) => (step, true),
             Step::World(step) => (step, false),
         };
+        let step_cells = if step_in_cells { step } else { step * length(to_sun) };
+        let longest = length(bounds.max.map(f64::from));
+        if scene.is_trilinear() && !scene.level_set && longest / step_cells > f64::from(MAX_STEPS) {
+            return Err(TraceError::StepTooSmall);
+        }
         Ok(Self {
             base,
             bounds,
@@ -249,7 +281,7 @@ impl Setup {
             sun_world,
             step,
             step_in_cells,
-            to_sun: apply3(&inverse, fog_sun),
+            to_sun,
             sun_cosine: std::array::from_fn(|r| dot(row(r), fog_sun)),
             sun_light: scene.light.sun_light(),
             sky_light: scene.light.sky_light(),
@@ -271,11 +303,13 @@ fn light_grid(bounds: Box3) -> (i32, [usize; 3]) {
             cells.div_ceil(spacing as usize) + 1
         })
     };
+    let across: usize = (0..3).map(|a| (bounds.max[a] - bounds.min[a]).max(0) as usize).sum();
+    let most = MAX_LIGHT_POINTS.min(MAX_LIGHT_STEPS / (across / L2_DIM as usize + FOG_STEPS));
     let is_enough = |spacing: &i32| {
         let points = points(*spacing);
-        points.into_iter().try_fold(1usize, usize::checked_mul).is_some_and(|n| n <= MAX_LIGHT_POINTS)
+        points.into_iter().try_fold(1usize, usize::checked_mul).is_some_and(|n| n <= most)
     };
-    // A box is at most MAX_CELL wide, and two points an axis are always few enough.
+    // A box is at most MAX_CELL wide, and two points an axis are few enough in any box.
     let spacing = (LIGHT_SPACING..=MAX_CELL).find(is_enough).unwrap_or(MAX_CELL);
     (spacing, points(spacing))
 }

@@ -22,19 +22,19 @@ pub struct Look {
     #[arg(long, help_heading = "Fog")]
     pub jitter: bool,
     /// Extinction: optical depth per world unit at density 1 [default: with --mode lit, half of the covered pixels have an optical depth above 3; otherwise, the highest density has 24 across the box]
-    #[arg(long, value_name = "X", help_heading = "Fog")]
+    #[arg(long, value_name = "X", allow_negative_numbers = true, help_heading = "Fog")]
     pub extinction: Option<f64>,
     /// Direction of the sun in degrees [default: 110,40]
     #[arg(long, value_name = "AZIMUTH,ELEVATION", allow_hyphen_values = true, help_heading = "Fog")]
     pub sun: Option<Sun>,
     /// Scattering albedo, 0 to 1 [default: 0.95; 0.6 with an emissive grid]
-    #[arg(long, value_name = "PART", help_heading = "Fog")]
+    #[arg(long, value_name = "PART", allow_negative_numbers = true, help_heading = "Fog")]
     pub albedo: Option<f64>,
     /// Anisotropy of scattering (g of Henyey and Greenstein): -0.99 backward, 0 isotropic, 0.99 forward [default: 0]
     #[arg(long, value_name = "G", allow_negative_numbers = true, help_heading = "Fog")]
     pub anisotropy: Option<f64>,
     /// Ambient light from the sky, as a factor [default: 1]
-    #[arg(long, value_name = "X", help_heading = "Fog")]
+    #[arg(long, value_name = "X", allow_negative_numbers = true, help_heading = "Fog")]
     pub ambient: Option<f64>,
     /// Emissive grid, or none [default: flame or temperature, if the pack has it]
     #[arg(long, value_name = "GRID", help_heading = "Fog")]
@@ -47,8 +47,11 @@ pub struct Look {
     pub kelvin: Option<f64>,
 }
 
+/// Largest number of a look: products of two are still numbers in the GPU's 32 bits.
+const LARGEST: f64 = 1e15;
+
 impl Look {
-    /// This look, with what it leaves open from another one.
+    /// Fills options that are not set from `other`.
     pub fn or(self, other: &Self) -> Self {
         Self {
             camera: self.camera.or(other.camera),
@@ -66,10 +69,10 @@ impl Look {
         }
     }
 
-    /// Whether its numbers make sense.
+    /// Checks that numbers are in range.
     ///
     /// # Errors
-    /// The first that does not, and what it can be.
+    /// The first that is not, and its range.
     pub fn check(&self) -> Result<(), String> {
         type IsAllowed = fn(f64) -> bool;
         let numbers: [(&str, Option<f64>, IsAllowed, &str); 6] = [
@@ -81,8 +84,11 @@ impl Look {
             ("kelvin", self.kelvin, |v| v > 0.0, "above 0"),
         ];
         for (name, value, is_allowed, what) in numbers {
-            if value.is_some_and(|v| !v.is_finite() || !is_allowed(v)) {
+            if value.is_some_and(|v| !is_allowed(v)) {
                 return Err(format!("{name} is a number {what}"));
+            }
+            if value.is_some_and(|v| v > LARGEST) {
+                return Err(format!("{name} is at most {LARGEST:e}"));
             }
         }
         Ok(())

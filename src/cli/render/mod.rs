@@ -102,7 +102,7 @@ impl FileType {
 /// The camera where none is asked for: from ahead, above and to the side.
 const VIEW: View = View::Orbit { azimuth: 40.0, elevation: 20.0, distance: None };
 
-/// The pack, and how it is to look: as the command line says, and where that is silent as the manifest says.
+/// The pack and its look. The command line overrides the manifest.
 fn subject(args: &RenderArgs) -> Result<(PathBuf, Look)> {
     let look = args.look.clone();
     match (&args.pack, &args.asset) {
@@ -119,7 +119,6 @@ pub fn run(args: &RenderArgs, common: Common) -> Result<()> {
     let file_type = FileType::of(&args.output)?;
     let (path, look) = subject(args)?;
     look.check().map_err(Error::Usage)?;
-    let view = look.camera.unwrap_or(VIEW);
     let pack = Pack::open(&path).map_err(Error::pack(&path))?;
     if args.output.canonicalize().is_ok_and(|o| path.canonicalize().is_ok_and(|p| o == p)) {
         return Err(Error::Usage(format!("{} is the pack and the picture too", args.output.display())));
@@ -136,7 +135,7 @@ pub fn run(args: &RenderArgs, common: Common) -> Result<()> {
 
     let extinction = match look.extinction {
         None if args.mode == Mode::Lit && !pack.grids()[grid].is_level_set() => {
-            renderer.body_extinction(grid, &view).map_err(|e| gpu_error(e, &path))?
+            renderer.body_extinction(grid).map_err(|e| gpu_error(e, &path))?
         }
         asked => asked,
     };
@@ -153,19 +152,30 @@ pub fn run(args: &RenderArgs, common: Common) -> Result<()> {
         let number = pack.grids()[grid].frames[frame].record.number;
         Ok((Picture { number, rgb: image.to_rgb8(&scene) }, image.mean_steps()))
     };
-    let drawn = frames.par_iter().map(draw).collect::<Result<Vec<_>>>();
+    // Two frames at a time hide what is not parallel within one; on a GPU there is nothing to hide.
+    let at_once = if renderer.is_gpu() { 1 } else { 2 };
+    let drawn = frames.chunks(at_once).map(|some| some.par_iter().map(draw).collect::<Result<Vec<_>>>());
+    let drawn = drawn.collect::<Result<Vec<_>>>();
     say(&|reporter| reporter.finish());
-    let (pictures, steps): (Vec<_>, Vec<_>) = drawn?.into_iter().unzip();
+    let (pictures, steps): (Vec<_>, Vec<_>) = drawn?.into_iter().flatten().unzip();
     write(args, file_type, &pictures, pack.grids()[grid].record.fps)?;
     if !common.quiet {
         let what = if frames.len() == 1 { "1 frame".to_owned() } else { format!("{} frames", frames.len()) };
         let steps = steps.iter().sum::<f64>() / frames.len() as f64;
         // What --extinction can be set from.
-        let shown = extinction.map(|extinction| format!(", extinction {extinction:.3}")).unwrap_or_default();
+        let shown = extinction
+            .map(|extinction| format!(", extinction {}", four_digits(extinction)))
+            .unwrap_or_default();
         let title = style::TITLE;
         outln!("{title}{}{title:#}: {what}, {steps:.1} steps a ray{shown}", args.output.display());
     }
     Ok(())
+}
+
+/// A number with four digits that say something.
+fn four_digits(number: f64) -> String {
+    let before_point = number.abs().log10().floor() as i32 + 1;
+    format!("{number:.*}", (4 - before_point).clamp(0, 30) as usize)
 }
 
 /// The place of a grid.
@@ -195,20 +205,15 @@ fn emissive(
     grids: &[Grid],
     shown: usize,
 ) -> std::result::Result<Option<usize>, String> {
-    if mode != Mode::Lit || grids[shown].is_level_set() {
-        return Ok(None);
-    }
+    let is_lit_fog = mode == Mode::Lit && !grids[shown].is_level_set();
     match look.emission.as_deref() {
         Some("none") => Ok(None),
-        Some(name) => named(grids, name).map(Some),
-        None => Ok(EMISSIVE
-            .iter()
-            .find_map(|name| {
-                grids
-                    .iter()
-                    .position(|grid| grid.name.to_lowercase() == *name && grid.record.active_max > 0.0)
-            })
-            .filter(|grid| *grid != shown)),
+        Some(name) => named(grids, name).map(|grid| Some(grid).filter(|_| is_lit_fog)),
+        None if !is_lit_fog => Ok(None),
+        None => Ok(EMISSIVE.iter().find_map(|name| {
+            let is_it = |grid: &Grid| grid.name.to_lowercase() == *name && grid.record.active_max > 0.0;
+            (0..grids.len()).find(|&grid| grid != shown && is_it(&grids[grid]))
+        })),
     }
 }
 
@@ -225,7 +230,7 @@ fn scene(
     let emission = emissive.and_then(|other| {
         let frame = grids[other].frames.iter().position(|frame| frame.record.number == number)?;
         let strength = look.emission_strength.unwrap_or(1.0);
-        Some(Emission::new(grids, other, frame, look.kelvin, strength))
+        Emission::new(grids, other, frame, look.kelvin, strength)
     });
     let light = Light::default();
     let usual_albedo = if emission.is_some() { SOOTY_ALBEDO } else { light.albedo };

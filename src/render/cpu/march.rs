@@ -3,16 +3,17 @@
 //! Each sample scatters light from a sun, whose optical depth is precomputed on a [`LightGrid`], and from a constant sky, and
 //! adds the emission of another grid. Scattering is single, with the phase function of Henyey and Greenstein ("Diffuse
 //! radiation in the galaxy", 1941). Absorption within a step is integrated analytically (Hillaire, "Physically based sky,
-//! atmosphere and cloud rendering in Frostbite", 2016), so that brightness does not depend on the step.
+//! atmosphere and cloud rendering in Frostbite", 2016), and the sun is sampled at the mean depth of what a step scatters, so
+//! that brightness hardly depends on the step.
 
 use rayon::prelude::*;
 
-use super::{MAX_STEPS, Tracer, Visited};
+use super::{Tracer, Visited};
 use crate::render::Mode;
 use crate::render::camera::dot;
 use crate::render::decoded_frame::Content;
 use crate::render::image::BACKDROP;
-use crate::render::scene::RAMP_STEPS;
+use crate::render::scene::{MAX_STEPS, RAMP_STEPS};
 use crate::render::traverse::{Box3, Ray, Real, Walk};
 use crate::volume::Coord;
 
@@ -163,7 +164,9 @@ impl<'a, F: Real> Tracer<'a, F> {
             depth = depth + thickness;
             let left = (-depth).exp();
             if thickness > zero {
-                let sunlight = (-self.depth_to_sun(p)).exp();
+                let by = samples.step * scattering_offset(thickness, through, left);
+                let lit = std::array::from_fn(|a| p[a] + ray.direction[a] * by);
+                let sunlight = (-self.depth_to_sun(lit)).exp();
                 light = std::array::from_fn(|c| light[c] + (through - left) * (sun[c] * sunlight + sky[c]));
             }
             if let Some(emission) = self.emission_at(p, visited) {
@@ -230,6 +233,16 @@ impl<'a, F: Real> Tracer<'a, F> {
         let low = low as usize;
         Some(std::array::from_fn(|c| color(low, c) * (F::from_i32(1) - part) + color(low + 1, c) * part))
     }
+}
+
+/// Where light that reaches the eye was scattered on average, from the middle of a step and in steps: denser fog scatters it
+/// nearer. `through` and `left` are the transmittance before and behind the step.
+fn scattering_offset<F: Real>(thickness: F, through: F, left: F) -> F {
+    // There the exact form would lose its digits, and the series is as good.
+    if thickness < F::from_f64(0.1) {
+        return -(thickness * F::from_f64(1.0 / 12.0));
+    }
+    F::from_i32(1) / thickness - left / (through - left) - F::from_f64(0.5)
 }
 
 /// Trilinear interpolation of eight values, ordered by x + 2y + 4z.

@@ -12,14 +12,11 @@ use self::march::LightGrid;
 use super::camera::normalise;
 use super::decoded_frame::{Content, DecodedBrick, DecodedFrame, Nearby};
 use super::image::{Image, apart, opacity};
-use super::scene::{Scene, Setup, TraceError};
+use super::scene::{MAX_STEPS, Scene, Setup, TraceError};
 use super::surface::{cubic, evaluate, first_change};
 use super::traverse::{Box3, Ray, Real, Walk};
 use super::{Mode, Traversal};
 use crate::volume::{BRICK_DIM, Coord};
-
-/// Steps after which a ray is given up: more than any box in view has cells across.
-const MAX_STEPS: u32 = 1 << 16;
 
 /// What a picture shows: a frame, and the frame of the emissive grid that [`Scene::emission`] names.
 #[derive(Clone, Copy)]

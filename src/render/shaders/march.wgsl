@@ -1,6 +1,6 @@
 // march.wgsl: a ray march through lit fog. It needs volpack.wgsl and hdda.wgsl. src/render/cpu/march.rs is its twin.
 //
-// For lit fog the host supplies two functions of a point in cells:
+// The host supplies two functions of a point in cells, which are used for lit fog only:
 //
 //   fn vp_depth_to_sun(p: vec3f) -> f32     optical depth from there to the sun, for instance from a grid of points
 //                                           that vp_voxel_depth filled, or from a shadow map
@@ -16,12 +16,15 @@
 // cell i is the voxel around i, so its rays begin half a cell farther on each axis.
 //
 // Scattering is single. Absorption within a step is integrated analytically (Hillaire, "Physically based sky,
-// atmosphere and cloud rendering in Frostbite", 2016), so that brightness does not depend on the step.
+// atmosphere and cloud rendering in Frostbite", 2016), and the sun is sampled at the mean depth of what a step
+// scatters, so that brightness hardly depends on the step.
+//
+// All rays of an invocation share VP_MAX_STEPS: a host that traces several sets vp_steps to 0 before each.
 
 // What a host may promise when it creates a pipeline.
 override VP_LIT: bool = true;       // radiance is needed, not the optical depth alone
 override VP_EMITS: bool = false;    // vp_emission may return light
-override VP_SKIPS: bool = true;     // constant nodes are left in one step
+override VP_SKIPS: bool = true;     // constant nodes are left in one step; by vp_march if they are empty
 
 struct VpFog {
     base: vec3i,            // the voxel that cell 0 is
@@ -114,6 +117,14 @@ fn vp_sample_from(t: f32, step: f32, offset: f32) -> f32 {
     return ceil(t / step - offset);
 }
 
+// Where light that reaches the eye was scattered on average, from the middle of a step and in steps: denser fog
+// scatters it nearer. The last two are the transmittance before and behind the step.
+fn vp_scattering_offset(thickness: f32, through: f32, left: f32) -> f32 {
+    // For thin steps the exact form would lose its digits, and the series is as good.
+    let exact = 1.0 / thickness - left / (through - left) - 0.5;
+    return select(exact, -thickness / 12.0, thickness < 0.1);
+}
+
 // Samples are at t = (number + offset) · step. Each looks up its node anew: a second loop for the samples of one brick
 // does not help, because neighbouring rays then sample at different times.
 fn vp_march(fog: VpFog, ray: VpRay, offset: f32) -> VpMarched {
@@ -161,7 +172,8 @@ fn vp_march(fog: VpFog, ray: VpRay, offset: f32) -> VpMarched {
         if VP_LIT {
             let left = exp(-depth);
             if thickness > 0.0 {
-                light += (through - left) * (fog.sun * exp(-vp_depth_to_sun(p)) + fog.sky);
+                let lit = p + ray.direction * (fog.step * vp_scattering_offset(thickness, through, left));
+                light += (through - left) * (fog.sun * exp(-vp_depth_to_sun(lit)) + fog.sky);
             }
             if VP_EMITS {
                 let seen = select((through - left) / thickness, through, thickness < VP_CLEAR);
