@@ -321,6 +321,7 @@ fn pictures_are_rendered_compared_and_kept() {
         (vec!["--grid", "heat"], "it has density"),
         (vec!["--frames", "20-24"], "no frame from 20 to 24; it has 1 to 8"),
         (vec!["--camera", "orbit:1"], "orbit:AZIMUTH"),
+        (vec!["--manifest", "pipeline.toml"], "cannot be used with"),
         (vec!["--step", "0"], "0.02world"),
         (vec!["--albedo", "1.5"], "albedo is a number from 0 to 1"),
         (vec!["--emission", "heat"], "no grid \"heat\"; it has density"),

@@ -64,11 +64,20 @@ impl Gpu {
     /// for once in a process, and takes a fraction of [`Gpu::shared`].
     pub fn identity() -> Option<&'static str> {
         static IDENTITY: OnceLock<Option<String>> = OnceLock::new();
-        let of = |adapter: wgpu::Adapter| {
-            let info = adapter.get_info();
+        let of = |info: &wgpu::AdapterInfo| {
             format!("{} {} {:?} {}", info.name, info.driver, info.backend, info.driver_info)
         };
-        IDENTITY.get_or_init(|| Self::adapter().ok().map(of)).as_deref()
+        IDENTITY.get_or_init(|| Self::info().map(of)).as_deref()
+    }
+
+    /// Whether the best adapter is a program on the CPU. No device is opened for that.
+    pub fn would_be_software() -> bool {
+        Self::info().is_some_and(|info| info.device_type == wgpu::DeviceType::Cpu)
+    }
+
+    fn info() -> Option<&'static wgpu::AdapterInfo> {
+        static INFO: OnceLock<Option<wgpu::AdapterInfo>> = OnceLock::new();
+        INFO.get_or_init(|| Self::adapter().ok().map(|adapter| adapter.get_info())).as_ref()
     }
 
     fn adapter() -> Result<wgpu::Adapter, GpuError> {
@@ -346,7 +355,8 @@ impl Queries {
     }
 }
 
-fn texture_format(codec: Codec) -> wgpu::TextureFormat {
+/// The format of a codec's texture.
+pub fn texture_format(codec: Codec) -> wgpu::TextureFormat {
     match codec.texture() {
         TextureFormat::Bc7RgbaUnorm => wgpu::TextureFormat::Bc7RgbaUnorm,
         TextureFormat::Bc4RUnorm => wgpu::TextureFormat::Bc4RUnorm,

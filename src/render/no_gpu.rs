@@ -30,6 +30,10 @@ impl Gpu {
         None
     }
 
+    pub fn would_be_software() -> bool {
+        false
+    }
+
     pub fn upload(&self, _: &Pack) -> Result<Uploaded, GpuError> {
         match self.never {}
     }

@@ -63,9 +63,8 @@ impl<'a> Renderer<'a> {
     /// # Errors
     /// See [`Renderer::new`].
     pub fn fastest(pack: &'a Pack, device: Device) -> Result<Self, GpuError> {
-        let is_software = |gpu: &Gpu| gpu.is_software;
         let device = match device {
-            Device::Auto if Gpu::shared().is_ok_and(is_software) => Device::Cpu,
+            Device::Auto if Gpu::would_be_software() => Device::Cpu,
             asked => asked,
         };
         Self::new(pack, device)

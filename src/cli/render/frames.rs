@@ -69,8 +69,11 @@ impl Frames {
     /// The places of these frames in a sequence.
     ///
     /// # Errors
-    /// A range in which there is no frame; all of it may lie outside of the sequence, or between two frames.
+    /// No frames at all, or a range in which there is none: it may lie outside of the sequence, or between two frames.
     pub fn places(&self, frames: &[Frame]) -> Result<Vec<usize>, String> {
+        let (Some(first), Some(last)) = (frames.first(), frames.last()) else {
+            return Err("it has no frames".to_owned());
+        };
         let Self::Numbered(ranges) = self else { return Ok((0..frames.len()).collect()) };
         let mut places = Vec::new();
         for range in ranges {
@@ -81,12 +84,7 @@ impl Frames {
                     true => format!("no frame {}", range.first),
                     false => format!("no frame from {} to {}", range.first, range.last),
                 };
-                return Err(match (frames.first(), frames.last()) {
-                    (Some(a), Some(b)) => {
-                        format!("{wanted}; it has {} to {}", a.record.number, b.record.number)
-                    }
-                    _ => "it has no frames".to_owned(),
-                });
+                return Err(format!("{wanted}; it has {} to {}", first.record.number, last.record.number));
             }
         }
         Ok(places)

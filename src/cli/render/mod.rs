@@ -29,7 +29,7 @@ use crate::settings::Look;
 #[derive(Args)]
 pub struct RenderArgs {
     /// Pack to render
-    #[arg(required_unless_present = "asset", conflicts_with = "asset")]
+    #[arg(required_unless_present = "asset", conflicts_with_all = ["manifest", "asset"])]
     pack: Option<PathBuf>,
     /// Asset of the manifest to render, with the look that the manifest gives it
     #[arg(long, value_name = "NAME")]
@@ -190,8 +190,7 @@ fn frames(args: &RenderArgs, all: &[Frame]) -> std::result::Result<Vec<usize>, S
     match (&args.frames, args.frame) {
         (Some(frames), _) => frames.places(all),
         (None, Some(number)) => Frames::one(number).places(all),
-        (None, None) if all.is_empty() => Err("it has no frames".to_owned()),
-        (None, None) => Ok(vec![0]),
+        (None, None) => Frames::All.places(all).map(|places| vec![places[0]]),
     }
 }
 

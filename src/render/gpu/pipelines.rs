@@ -81,7 +81,7 @@ impl Pipelines {
         let checks =
             wgpu::ShaderRuntimeChecks { force_loop_bounding: false, ..wgpu::ShaderRuntimeChecks::checked() };
         // SAFETY: without these checks all loops must end, and they do whatever the pack says: walks count
-        // steps up to MAX_STEPS or VP_MAX_STEPS, or move towards a plane a cell at a time, `vp_settle` moves one way between
+        // steps up to VP_MAX_STEPS or move towards a plane a cell at a time, `vp_settle` moves one way between
         // two cells, parts of a cell are 8, halvings 24.
         let module = unsafe { device.create_shader_module_trusted(shader, checks) };
         let bindings = bindings(device);

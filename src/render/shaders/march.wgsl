@@ -26,12 +26,17 @@ override VP_LIT: bool = true;       // radiance is needed, not the optical depth
 override VP_EMITS: bool = false;    // vp_emission may return light
 override VP_SKIPS: bool = true;     // constant nodes are left in one step; by vp_march if they are empty
 
-struct VpFog {
+// What is traced of a grid's frame.
+struct VpBox {
     base: vec3i,            // the voxel that cell 0 is
     grid: u32,
     low: vec3i,             // the cells to trace, from low to high (outside)
     frame: u32,
     high: vec3i,
+}
+
+struct VpFog {
+    box: VpBox,
     extinction: f32,        // optical depth of a density of 1 over a world unit
     sun: vec3f,             // unoccluded sunlight times albedo and phase function
     step: f32,              // between two samples, in t of the ray
@@ -44,7 +49,7 @@ const VP_OPAQUE = 7.0;
 const VP_CLEAR = 1e-4;
 const VP_MAX_STEPS = 65536u;
 
-// Regions left and samples taken.
+// Regions left, voxels stepped through and samples taken.
 var<private> vp_steps: u32;
 
 // The node around a ray's cell, as far as it is traced: from low to high (outside).
@@ -55,29 +60,29 @@ struct VpPlace {
     high: vec3i,
 }
 
-fn vp_place(fog: VpFog, g: VpGrid, last: VpCell, cell: vec3i) -> VpPlace {
-    let p = cell + fog.base;
-    let l2 = vp_cell(g, fog.frame, last, p);
+fn vp_place(box: VpBox, g: VpGrid, last: VpCell, cell: vec3i) -> VpPlace {
+    let p = cell + box.base;
+    let l2 = vp_cell(g, box.frame, last, p);
     let node = vp_find(g, l2, p);
-    let low = node.min - fog.base;
-    return VpPlace(l2, node, max(low, fog.low), min(low + node.dim, fog.high));
+    let low = node.min - box.base;
+    return VpPlace(l2, node, max(low, box.low), min(low + node.dim, box.high));
 }
 
-fn vp_traced(fog: VpFog, walk: VpWalk) -> bool {
-    return vp_inside(walk.cell, fog.low, fog.high) && vp_steps < VP_MAX_STEPS;
+fn vp_traced(box: VpBox, walk: VpWalk) -> bool {
+    return vp_inside(walk.cell, box.low, box.high) && vp_steps < VP_MAX_STEPS;
 }
 
 // The integral of density over distance, voxel by voxel. Densities below 0 count as 0.
 fn vp_voxel_depth(fog: VpFog, ray: VpRay) -> f32 {
     var depth = 0.0;
-    var walk = vp_enter(ray, fog.low, fog.high);
-    if !vp_traced(fog, walk) {
+    var walk = vp_enter(ray, fog.box.low, fog.box.high);
+    if !vp_traced(fog.box, walk) {
         return depth;
     }
-    let g = vp_grid(fog.grid);
+    let g = vp_grid(fog.box.grid);
     var cell = VP_NOWHERE;
-    while vp_traced(fog, walk) {
-        let at = vp_place(fog, g, cell, walk.cell);
+    while vp_traced(fog.box, walk) {
+        let at = vp_place(fog.box, g, cell, walk.cell);
         cell = at.cell;
         if VP_SKIPS && at.node.constant {
             vp_steps++;
@@ -90,7 +95,7 @@ fn vp_voxel_depth(fog: VpFog, ray: VpRay) -> f32 {
         let behind = vp_behind(ray, at.low, at.high);
         loop {
             vp_steps++;
-            let value = vp_value(g, brick, walk.cell + fog.base);
+            let value = vp_value(g, brick, walk.cell + fog.box.base);
             let start = walk.t;
             walk = vp_step(ray, walk);
             depth += (walk.t - start) * max(value, 0.0);
@@ -131,12 +136,12 @@ fn vp_march(fog: VpFog, ray: VpRay, offset: f32) -> VpMarched {
     var light = vec3f(0.0);
     var depth = 0.0;
     var through = 1.0;
-    let walk = vp_enter(ray, fog.low, fog.high);
-    if !vp_traced(fog, walk) {
+    let walk = vp_enter(ray, fog.box.low, fog.box.high);
+    if !vp_traced(fog.box, walk) {
         return VpMarched(light, depth);
     }
-    let g = vp_grid(fog.grid);
-    let end = vp_exit(ray, fog.low, fog.high);
+    let g = vp_grid(fog.box.grid);
+    let end = vp_exit(ray, fog.box.low, fog.box.high);
     var l2 = VP_NOWHERE;
     var next = vp_sample_from(walk.t, fog.step, offset);
     while depth < VP_OPAQUE && vp_steps < VP_MAX_STEPS {
@@ -148,16 +153,16 @@ fn vp_march(fog: VpFog, ray: VpRay, offset: f32) -> VpMarched {
         next += 1.0;
         let p = ray.origin + ray.direction * t;
         // Rounding may put p just outside the box.
-        let cell = clamp(vec3i(floor(p)), fog.low, fog.high - 1);
-        let voxel = cell + fog.base;
-        l2 = vp_cell(g, fog.frame, l2, voxel);
+        let cell = clamp(vec3i(floor(p)), fog.box.low, fog.box.high - 1);
+        let voxel = cell + fog.box.base;
+        l2 = vp_cell(g, fog.box.frame, l2, voxel);
         let node = vp_find(g, l2, voxel);
         var density = node.value;
         // A cell has the next voxels as corners, so the last layer of a node's cells is not constant, unless the nodes
         // around it are background too.
         let skips = VP_SKIPS && node.constant;
         let alone = skips && node.dim == 8 && vp_alone(l2, voxel);
-        let low = node.min - fog.base;
+        let low = node.min - fog.box.base;
         let inner = low + node.dim - select(1, 0, alone);
         if skips && all(cell < inner) {
             if !VP_EMITS && density <= 0.0 {
@@ -165,7 +170,7 @@ fn vp_march(fog: VpFog, ray: VpRay, offset: f32) -> VpMarched {
                 continue;
             }
         } else {
-            density = vp_between(vp_corners(g, fog.frame, l2, vp_brick(g, node), voxel), p - vec3f(cell));
+            density = vp_between(vp_corners(g, fog.box.frame, l2, vp_brick(g, node), voxel), p - vec3f(cell));
         }
         let thickness = max(density, 0.0) * fog.step * fog.extinction;
         depth += thickness;

@@ -64,28 +64,14 @@ const STEPS = 4u;
 const NODES = 5u;
 const NORMALS = 6u;
 const LIT = 7u;
-const MAX_STEPS = 65536u;
 
-var<private> steps: u32;
-
-// The node around a ray's cell, as far as it is traced: from low to high (outside).
-struct Place {
-    cell: VpCell,
-    node: VpNode,
-    low: vec3i,
-    high: vec3i,
-}
-
-fn place_of(g: VpGrid, last: VpCell, cell: vec3i) -> Place {
-    let p = cell + params.base;
-    let l2 = vp_cell(g, params.frame, last, p);
-    let node = vp_find(g, l2, p);
-    let low = node.min - params.base;
-    return Place(l2, node, max(low, params.low), min(low + node.dim, params.high));
+// What the picture shows.
+fn box_of() -> VpBox {
+    return VpBox(params.base, params.grid, params.low, params.frame, params.high);
 }
 
 fn traced(walk: VpWalk) -> bool {
-    return vp_inside(walk.cell, params.low, params.high) && steps < MAX_STEPS;
+    return vp_traced(box_of(), walk);
 }
 
 // The fog of the picture; the ray's t is in world units.
@@ -93,8 +79,7 @@ fn fog_of(ray: VpRay) -> VpFog {
     let t_of_step = select(1.0, 1.0 / length(ray.direction), params.step_in_cells != 0u);
     let phase = vp_phase(params.anisotropy, dot(ray.direction, params.sun_cosine));
     return VpFog(
-        params.base, params.grid, params.low, params.frame, params.high, params.extinction,
-        params.sun_light * phase, params.step * t_of_step, params.sky_light,
+        box_of(), params.extinction, params.sun_light * phase, params.step * t_of_step, params.sky_light,
     );
 }
 
@@ -163,10 +148,10 @@ fn first_density(ray: VpRay) -> Hit {
     let g = vp_grid(params.grid);
     var cell = VP_NOWHERE;
     while traced(walk) {
-        let at = place_of(g, cell, walk.cell);
+        let at = vp_place(box_of(), g, cell, walk.cell);
         cell = at.cell;
         if HDDA && at.node.constant {
-            steps++;
+            vp_steps++;
             if at.node.value > params.threshold {
                 return Hit(true, walk.t, walk.cell, walk.axis, at.node.value);
             }
@@ -176,13 +161,13 @@ fn first_density(ray: VpRay) -> Hit {
         let brick = vp_brick(g, at.node);
         let behind = vp_behind(ray, at.low, at.high);
         loop {
-            steps++;
+            vp_steps++;
             let value = vp_value(g, brick, walk.cell + params.base);
             if value > params.threshold {
                 return Hit(true, walk.t, walk.cell, walk.axis, value);
             }
             walk = vp_step(ray, walk);
-            if any(walk.cell == behind) || steps >= MAX_STEPS {
+            if any(walk.cell == behind) || vp_steps >= VP_MAX_STEPS {
                 break;
             }
         }
@@ -201,11 +186,11 @@ fn first_sign(ray: VpRay) -> Hit {
     // Before the box the sign is the background's.
     var first = select(VP_EITHER, u32(g.background < 0.0), walk.axis < 3);
     while traced(walk) {
-        let at = place_of(g, cell, walk.cell);
+        let at = vp_place(box_of(), g, cell, walk.cell);
         cell = at.cell;
         let sign = vp_sign(g, at.node);
         if HDDA && at.node.constant {
-            steps++;
+            vp_steps++;
             if first + sign == VP_NEGATIVE {
                 return Hit(true, walk.t, walk.cell, walk.axis, 1.0);
             }
@@ -216,7 +201,7 @@ fn first_sign(ray: VpRay) -> Hit {
         let brick = vp_brick(g, at.node);
         let behind = vp_behind(ray, at.low, at.high);
         loop {
-            steps++;
+            vp_steps++;
             var here = sign;
             if here == VP_EITHER {
                 here = u32(vp_value(g, brick, walk.cell + params.base) < 0.0);
@@ -226,7 +211,7 @@ fn first_sign(ray: VpRay) -> Hit {
             }
             first = here;
             walk = vp_step(ray, walk);
-            if any(walk.cell == behind) || steps >= MAX_STEPS {
+            if any(walk.cell == behind) || vp_steps >= VP_MAX_STEPS {
                 break;
             }
         }
@@ -252,7 +237,7 @@ fn first_surface(ray: VpRay) -> Hit {
     var known = walk.axis < 3;
     var negative = known && g.background < 0.0;
     while traced(walk) {
-        let at = place_of(g, l2, walk.cell);
+        let at = vp_place(box_of(), g, l2, walk.cell);
         l2 = at.cell;
         let skips = HDDA && at.node.constant;
         let alone = skips && at.node.dim == 8 && vp_alone(l2, walk.cell + params.base);
@@ -264,7 +249,7 @@ fn first_surface(ray: VpRay) -> Hit {
         var signs = 0xfffcu | vp_sign(g, at.node);
         let brick = vp_brick(g, at.node);
         loop {
-            steps++;
+            vp_steps++;
             if skips && vp_inside(walk.cell, at.low, inner) {
                 let sign = at.node.value < 0.0;
                 if known && negative != sign {
@@ -273,7 +258,7 @@ fn first_surface(ray: VpRay) -> Hit {
                 known = true;
                 negative = sign;
                 walk = vp_leave(ray, walk, at.low, inner);
-                if at.node.dim > 8 || any(walk.cell == behind) || steps >= MAX_STEPS {
+                if at.node.dim > 8 || any(walk.cell == behind) || vp_steps >= VP_MAX_STEPS {
                     break;
                 }
                 continue;
@@ -323,7 +308,7 @@ fn first_surface(ray: VpRay) -> Hit {
                 }
             }
             walk = vp_step(ray, walk);
-            if any(walk.cell == behind) || steps >= MAX_STEPS {
+            if any(walk.cell == behind) || vp_steps >= VP_MAX_STEPS {
                 break;
             }
         }
@@ -337,7 +322,7 @@ fn normal_at(ray: VpRay, hit: Hit) -> vec3f {
         return select(vec3f(0.0), select(vec3f(1.0), vec3f(-1.0), ray.forward), VP_AXES == vec3i(hit.axis));
     }
     let g = vp_grid(params.grid);
-    let at = place_of(g, VP_NOWHERE, hit.cell);
+    let at = vp_place(box_of(), g, VP_NOWHERE, hit.cell);
     let c = vp_corners(g, params.frame, at.cell, vp_brick(g, at.node), hit.cell + params.base);
     let p = clamp(local(ray, hit.cell, hit.t), vec3f(0.0), vec3f(1.0));
     let slope = gradient(c, p);
@@ -406,7 +391,6 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
     if id.x >= params.width || id.y >= params.height {
         return;
     }
-    steps = 0u;
     vp_steps = 0u;
     let x = f32(2u * id.x + 1u) / f32(params.width) - 1.0;
     let y = 1.0 - f32(2u * id.y + 1u) / f32(params.height);
@@ -424,11 +408,10 @@ fn main(@builtin(global_invocation_id) id: vec3u) {
     } else {
         color = vec3f(1.0 - exp(-(vp_voxel_depth(fog_of(ray), ray) * params.extinction)));
     }
-    steps += vp_steps;
     if MODE == STEPS {
-        color = vec3f(f32(steps));
+        color = vec3f(f32(vp_steps));
     }
-    output[id.y * params.width + id.x] = vec4f(color, f32(steps));
+    output[id.y * params.width + id.x] = vec4f(color, f32(vp_steps));
 }
 
 // Fills the light grid: optical depths to the sun.

@@ -2,12 +2,6 @@
 
 override KEEP: bool = false;        // whether a brick's record is kept while the ray is in the brick
 
-fn interpolate(c: VpCorners, f: vec3f) -> f32 {
-    let z = mix(c.near, c.far, f.z);
-    let y = mix(z.xy, z.zw, f.y);
-    return mix(y.x, y.y, f.x);
-}
-
 fn march(ray: Ray) -> f32 {
     let g = vp_grid(0u);
     var cell = VP_NOWHERE;
@@ -43,11 +37,11 @@ fn march(ray: Ray) -> f32 {
                 } else {
                     c = vp_corners(g, 0u, cell, brick, voxel);
                 }
-                sum += interpolate(c, p - low);
+                sum += vp_between(c, p - low);
                 k++;
             }
         } else {
-            sum += interpolate(vp_corners(g, 0u, cell, brick, voxel), place(ray, k) - low);
+            sum += vp_between(vp_corners(g, 0u, cell, brick, voxel), place(ray, k) - low);
             k++;
         }
     }

@@ -4,14 +4,14 @@ use std::collections::HashMap;
 use std::error::Error;
 
 use bytemuck::{Pod, Zeroable as _};
-use volpack::codec::{Codec, TextureFormat};
-use volpack::render::gpu::VOLPACK_WGSL;
+use volpack::codec::Codec;
+use volpack::render::gpu::{VOLPACK_WGSL, texture_format};
 use wgpu::util::DeviceExt;
 
 use super::atlas::Texture;
 use super::params::{Atlas, Params};
 
-/// Pixels of a workgroup, as `main` in march.wgsl has them.
+/// Pixels of a workgroup, as `main` in density.wgsl and surface.wgsl has them.
 const WORKGROUP: [u32; 2] = [8, 16];
 /// Frames of one submission: a query set has at most 4096 timestamps.
 const FRAMES_AT_ONCE: u32 = 1000;
@@ -117,7 +117,7 @@ impl Gpu {
             };
         }
         let views = Codec::WITH_TEXELS.map(|codec| match textures.iter().find(|t| t.codec == codec) {
-            Some(texture) => self.texture(format_of(codec), texture.size, &texture.bytes),
+            Some(texture) => self.texture(texture_format(codec), texture.size, &texture.bytes),
             None => self.texture(wgpu::TextureFormat::R8Unorm, [1; 3], &[0]),
         });
         Ok(Textures { views, atlases })
@@ -317,14 +317,4 @@ fn bindings(device: &wgpu::Device) -> wgpu::BindGroupLayout {
         })
         .collect();
     device.create_bind_group_layout(&wgpu::BindGroupLayoutDescriptor { label: None, entries: &entries })
-}
-
-fn format_of(codec: Codec) -> wgpu::TextureFormat {
-    match codec.texture() {
-        TextureFormat::Bc7RgbaUnorm => wgpu::TextureFormat::Bc7RgbaUnorm,
-        TextureFormat::Bc4RUnorm => wgpu::TextureFormat::Bc4RUnorm,
-        TextureFormat::R8Unorm => wgpu::TextureFormat::R8Unorm,
-        TextureFormat::R16Float => wgpu::TextureFormat::R16Float,
-        TextureFormat::R32Float => wgpu::TextureFormat::R32Float,
-    }
 }
